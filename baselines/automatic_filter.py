@@ -30,7 +30,7 @@ from eitbench.estimation import (
 )
 from eitbench.estimation.inflow_prior import nominal_worlds, source_world
 from eitbench.estimation.walk import RandomWalk
-from eitbench.physics.rest import AtRest
+from eitbench.physics.stationary import StationaryTransport
 
 HERE = Path(__file__).parent
 BOUNDS = (0.05, 4.0)
@@ -73,7 +73,7 @@ class Estimator:
 def choose(task: Task, c_ref: float, prior, model):
     """Return the filter at t = 0."""
     extended = linearise_at_prediction(task)
-    if isinstance(task.transport, AtRest | RandomWalk):
+    if isinstance(task.transport, StationaryTransport | RandomWalk):
         return Filter(LogStates(nodal_states(task.transport, task.prior, 1.0), c_ref), extended)
     if prior is None and task.velocity is None:
         states = nodal_states(task.transport, task.prior, c_ref)

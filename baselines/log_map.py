@@ -10,7 +10,7 @@ import numpy as np
 
 from eitbench import Estimate, Task
 from eitbench.estimation import CalibrationFrame, gauss_newton, initial_covariance
-from eitbench.physics.rest import AtRest
+from eitbench.physics.stationary import StationaryTransport
 
 
 class Estimator:
@@ -23,7 +23,7 @@ class Estimator:
 
     @staticmethod
     def suits(task: Task) -> bool:
-        return isinstance(task.transport, AtRest)
+        return isinstance(task.transport, StationaryTransport)
 
     def update(self, voltages: np.ndarray, currents: np.ndarray) -> Estimate:
         task = self.task

@@ -16,7 +16,7 @@ from eitbench.estimation import (
     nodal_states,
 )
 from eitbench.estimation.walk import RandomWalk
-from eitbench.physics.rest import AtRest
+from eitbench.physics.stationary import StationaryTransport
 
 
 class Estimator:
@@ -29,7 +29,7 @@ class Estimator:
 
     @staticmethod
     def suits(task: Task) -> bool:
-        return isinstance(task.transport, AtRest | RandomWalk)
+        return isinstance(task.transport, StationaryTransport | RandomWalk)
 
     def update(self, voltages: np.ndarray, currents: np.ndarray) -> Estimate | None:
         return self.estimator.update(voltages, currents)

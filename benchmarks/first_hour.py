@@ -22,9 +22,9 @@ from eitbench.bench.tracks import own_ids
 OBSERVATION = "import sys, gymnasium, eitbench\ngymnasium.make(sys.argv[1]).reset()"
 RECORD = """
 import sys
-from eitbench.data.bank import fill_here
+from eitbench.data.presimulation import presimulate_inline
 from eitbench.worlds.registry import entry
-fill_here(entry(sys.argv[1]).world, range(int(sys.argv[2])))
+presimulate_inline(entry(sys.argv[1]).world, range(int(sys.argv[2])))
 """
 FRAMES = 20_000
 """that PPO learns from"""

@@ -34,7 +34,7 @@ def rows() -> Iterator[Row]:
         yield both(f"a step of {columns} flow{'s' * (columns > 1)}, {name}, "
                    f"{plain.mesh.n_nodes:,} nodes", flows, lambda cd, c=c: cd.step(c, 30.0, 31.0))
     identity = np.eye(1701)
-    flows = [kind(PIPE_2D.model().transport.mesh, VELOCITY, PIPE_2D.flow.diffusivity,
+    flows = [kind(PIPE_2D.estimator_model().transport.mesh, VELOCITY, PIPE_2D.flow.diffusivity,
                   PIPE_2D.time_step, inlet=np.arange(21))
              for kind in (ConvectionDiffusion, reference_flow)]
     yield both("F, column by column, 1,701 nodes", flows,

@@ -68,7 +68,7 @@ def problem(cells: tuple[int, int], steps: int = WARM_UP + STEPS) -> Problem:
 
 def pipe_model(cells: tuple[int, int]) -> Discretisation:
     """The estimators' model, but with so many cells of concentration along and across the pipe."""
-    told = PIPE_2D.model()
+    told = PIPE_2D.estimator_model()
     pipe = PIPE_2D.vessel
     known = told.transport
     assert isinstance(known, ConvectionDiffusion)
@@ -79,7 +79,7 @@ def pipe_model(cells: tuple[int, int]) -> Discretisation:
                                     substeps=known.substeps, inlet=np.arange(cells[1] + 1))
     cem = told.observation.cem
     seen = ObservationModel(cem, mesh.interpolation_to(cem.mesh.points),
-                            told.observation.conductivity, told.observation.smallest_concentration)
+                            told.observation.conductivity, told.observation.min_concentration)
     return Discretisation(transport, seen)
 
 

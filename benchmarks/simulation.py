@@ -15,8 +15,8 @@ from forward import system_matrix
 from references import reference_flow
 from solvers import refactorisations
 
-from eitbench.data.bank import recording_bytes
-from eitbench.data.episodes import simulate, simulate_together, truth_discretisation
+from eitbench.data.episodes import cached_truth_model, simulate, simulate_batch
+from eitbench.data.presimulation import cached_episode_bytes
 from eitbench.physics.flow import PlaneChannelFlow
 from eitbench.worlds.catalogue import PIPE_2D
 
@@ -24,7 +24,7 @@ BANK = 256
 
 
 def rows() -> Iterator[Row]:
-    transport, observation = truth_discretisation(PIPE_2D)
+    transport, observation = cached_truth_model(PIPE_2D)
     cem = observation.cem
     n = transport.mesh.n_nodes
     n_steps = PIPE_2D.n_steps
@@ -36,7 +36,7 @@ def rows() -> Iterator[Row]:
     times = compare({**peers, "solve": lambda: flow._solver.factors.solve(right)}, 5)
     solve = times.pop("solve")
     name = min(times, key=lambda peer: times[peer])
-    n_solves = (n_steps + PIPE_2D.lead_in) * round(PIPE_2D.time_step
+    n_solves = (n_steps + PIPE_2D.spin_up_steps) * round(PIPE_2D.time_step
                                                    / transport.time_step) * (transport.substeps + 1)
     bare = n_steps * times[name] + n_solves * solve
     against = (f"{n_steps} bare refactorisations by {name}, {cem.n_unknowns:,} unknowns, "
@@ -47,7 +47,7 @@ def rows() -> Iterator[Row]:
     yield Row("simulation", f"a new episode, T = {n_steps}", against, alone, bare, "≤ 1.5×",
               "bytes: the flow's factors are read at every sub-step")
     begin = time.perf_counter()
-    for _ in simulate_together(PIPE_2D, range(8), progress=False):
+    for _ in simulate_batch(PIPE_2D, range(8), progress=False):
         pass
     yield Row("simulation", "each of eight new episodes simulated together", "one alone",
               (time.perf_counter() - begin) / 8, alone, "",
@@ -56,7 +56,8 @@ def rows() -> Iterator[Row]:
     yield Row("simulation", f"`eitbench bank`, {BANK} episodes, two processes", "one process", two,
               one,
               "≥ 1.8× faster", "both cores; each process imports, and builds the truth's meshes",
-              f"{quantity(two / BANK, 's')} and {recording_bytes(PIPE_2D) / 1e6:.2f} MB an episode")
+              f"{quantity(two / BANK, 's')} and {cached_episode_bytes(PIPE_2D) / 1e6:.2f} MB "
+              "an episode")
 
 
 def bank(jobs: int) -> float:

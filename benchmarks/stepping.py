@@ -16,7 +16,7 @@ import numpy as np
 from common import Row, ceilings, in_fresh_process, peak_growth
 
 import eitbench  # noqa: F401 (registers)
-from eitbench.data.bank import fill
+from eitbench.data.presimulation import presimulate
 from eitbench.worlds.catalogue import PIPE_2D
 
 ESTIMATION, INJECTION = "eitbench/Pipe2D-v0", "eitbench/Pipe2DInjection-v0"
@@ -26,7 +26,7 @@ ENVS = 64
 
 
 def rows() -> Iterator[Row]:
-    fill(PIPE_2D, range(EPISODES), n_jobs=1)
+    presimulate(PIPE_2D, range(EPISODES), n_jobs=1)
     yield from starting()
     yield from estimation()
     yield from injection()
@@ -142,7 +142,7 @@ COUNTS = (1, 4, 16, 64, 256)
 
 def environments() -> Iterator[tuple[str, list[float], list[float]]]:
     """Kind, steps per second and peak bytes for `COUNTS` environments at once, for the figure."""
-    fill(PIPE_2D, range(EPISODES), n_jobs=1)
+    presimulate(PIPE_2D, range(EPISODES), n_jobs=1)
     for kind in KINDS:
         measured = [in_fresh_process(growth, kind, count) for count in COUNTS]
         yield kind, *(list(values) for values in zip(*measured, strict=True))

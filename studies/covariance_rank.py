@@ -12,7 +12,7 @@ import time
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from eitbench.data.recordings import cycle_voltages, recording, score_operators
+from eitbench.data.episode_cache import cached_episode, cycle_voltages, score_operators
 from eitbench.envs.estimation import EstimationEnv
 from eitbench.estimation import (
     CalibrationFrame,
@@ -34,7 +34,7 @@ def main() -> None:
     task = env.task
     world = env.world
     env.reset(seed=0)
-    voltages = cycle_voltages(world, 0, recording(world, 0))
+    voltages = cycle_voltages(world, 0, cached_episode(world, 0))
     currents = task.currents[np.arange(task.n_steps) % len(task.currents)]
     first = CalibrationFrame(task)
     for k in range(first.length):

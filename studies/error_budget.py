@@ -28,7 +28,7 @@ from eitbench.estimation import (
     inflow_filter,
 )
 from eitbench.physics.observation import VoltageNoise
-from eitbench.worlds.streams import randomness
+from eitbench.worlds.random_streams import episode_streams
 from eitbench.worlds.task import make_task
 
 ID = "eitbench/Pipe2D-v0"
@@ -74,10 +74,10 @@ class ErrorBudget:
         task = self.task
         world = self.examples.world
         if from_prior:
-            steps = world.lead_in + task.n_steps + 1
+            steps = world.spin_up_steps + task.n_steps + 1
             correlation = self.prior.time_covariance(steps)
             lags = np.abs(np.subtract.outer(np.arange(steps), np.arange(steps)))
-            x = np.linalg.cholesky(correlation[lags]) @ randomness(seed).policy.normal(
+            x = np.linalg.cholesky(correlation[lags]) @ episode_streams(seed).policy.normal(
                 size=(steps, self.prior.modes.shape[1]))
             inflow = self.prior.inverse_link(x @ self.prior.modes.T)
         else:
@@ -94,7 +94,7 @@ class ErrorBudget:
     def measure(self, states: np.ndarray, injections: Injections, noise: VoltageNoise,
                 seed: int) -> list[tuple[np.ndarray, np.ndarray]]:
         """Simulate voltages and currents (J, L) of each state with the model of the filter."""
-        random = randomness(seed).noise
+        random = episode_streams(seed).noise
         measurements = []
         for t, state in enumerate(states, start=1):
             currents = injections(t)
@@ -169,7 +169,7 @@ class ErrorBudget:
                           noise_factor: float = 1.0) -> EpisodeErrors:
         """Run the filter on an episode of its model."""
         noise = VoltageNoise(noise_factor * self.task.noise.relative,
-                             noise_factor * self.task.noise.of_largest)
+                             noise_factor * self.task.noise.relative_to_max)
         states = self.model_states(seed, from_prior)
         measurements = self.measure(states, injections, noise, seed)
         square = np.einsum("tn,nt->t", states, self.mass @ states.T)

@@ -30,7 +30,7 @@ SEEDS, STATES = "train:0-3", range(20, 99, 6)
 def main() -> None:
     world = PIPE_2D
     pipe = world.vessel
-    truth, model = world.truth(), world.model()
+    truth, model = world.truth_model(), world.estimator_model()
     mesh = graded_pipe_mesh(pipe.length, pipe.half_width, pipe.electrode_spans, 24, 44)
     reference = ObservationModel(
         CompleteElectrodeModel(mesh, pipe.electrodes(mesh), pipe.contact_impedance),

@@ -13,7 +13,7 @@ from forward_error import _transport_error
 from threadpoolctl import threadpool_limits
 
 from eitbench import simulate
-from eitbench.numerics.round import round_pipe_mesh
+from eitbench.numerics.round_meshes import round_pipe_mesh
 from eitbench.physics.cem import CompleteElectrodeModel
 from eitbench.physics.observation import ObservationModel
 from eitbench.worlds.catalogue import PIPE_3D
@@ -29,7 +29,7 @@ STATES = range(20, 66, 15)
 def main() -> None:
     world = PIPE_3D
     pipe = world.vessel
-    truth, model = world.truth(), world.model()
+    truth, model = world.truth_model(), world.estimator_model()
     concentration = simulate(world, 0).concentration.astype(float)
     states = concentration[list(STATES)]
 

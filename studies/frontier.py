@@ -25,7 +25,7 @@ from thesis.common import (
 )
 
 from eitbench import scoring
-from eitbench.data.recordings import score_operators
+from eitbench.data.episode_cache import score_operators
 from eitbench.data.seeds import parse_seeds
 from eitbench.envs.estimation import EstimationEnv
 from eitbench.worlds.task import Estimate

@@ -22,9 +22,9 @@ from tqdm import tqdm, trange
 
 import eitbench
 from eitbench._files import write_atomically
-from eitbench.data.bank import fill
-from eitbench.data.dataset import Dataset, Example, strongest
-from eitbench.data.parallel import in_parallel
+from eitbench.data.dataset import Dataset, Example, pod_basis
+from eitbench.data.parallel import run_parallel
+from eitbench.data.presimulation import presimulate
 from eitbench.data.seeds import parse_seeds
 from eitbench.estimation import (
     CalibrationFrame,
@@ -34,7 +34,7 @@ from eitbench.estimation import (
     compatible_priors,
 )
 from eitbench.estimation.identified import task_fingerprint
-from eitbench.worlds.streams import randomness
+from eitbench.worlds.random_streams import episode_streams
 from eitbench.worlds.task import make_task
 from eitbench.worlds.world import World
 
@@ -107,7 +107,7 @@ FEATURES = ("inputs", "reduced", "truth", "rest", "weight")
 def pod_modes(examples: Dataset, q: int) -> dict[str, np.ndarray]:
     """Return ``basis`` (n, q), the leading modes of the scored states, orthonormal in M̃, and
     ``rest`` (n,), the mean square of the projection error of c/c_0 − 1."""
-    basis, residual = strongest(examples, q)
+    basis, residual = pod_basis(examples, q)
     return {"basis": basis, "rest": residual / examples.world.background**2}
 
 
@@ -145,7 +145,7 @@ def features(examples: Dataset, example: Example, basis: np.ndarray,
 def project(examples: Dataset, example: Example, basis: np.ndarray,
             c_ref: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return true modes (T, q) of c/c_ref − 1, and two numbers per step as in `features`."""
-    reduced = examples.reduced(c_ref * basis, c_ref).of(example)
+    reduced = examples.project(c_ref * basis, c_ref).project_example(example)
     return reduced.truth, c_ref**2 / reduced.square, reduced.unresolved / reduced.square
 
 
@@ -209,7 +209,7 @@ def load_features(setup: TrainingSetup, seeds: list[int]) -> Tensors:
 def scaled_velocities(world: World, seeds: Sequence[int]) -> torch.Tensor:
     """Return the mean velocities (N, 1) of the episodes, standardised by `VELOCITY_SCALING`."""
     mean, std = VELOCITY_SCALING
-    drawn = [world.flow.draw(world, randomness(seed).flow)(1).mean_velocity for seed in seeds]
+    drawn = [world.flow.draw(world, episode_streams(seed).flow)(1).mean_velocity for seed in seeds]
     return (torch.tensor(drawn, dtype=torch.float32)[:, None] - mean) / std
 
 
@@ -292,10 +292,10 @@ def main(
     train_seeds = parse_seeds(f"train:0-{max(setup.episodes) - 1}")
     dev_seeds = parse_seeds("dev:0-31")
     world = eitbench.dataset(setup.env, train_seeds).world
-    fill(world, train_seeds + dev_seeds, n_jobs=jobs)
+    presimulate(world, train_seeds + dev_seeds, n_jobs=jobs)
     modes = cached_modes(setup)
     jobs_to_do = [(setup, seed, modes["basis"]) for seed in train_seeds + dev_seeds]
-    list(tqdm(in_parallel(episode_features, jobs_to_do, jobs), total=len(jobs_to_do),
+    list(tqdm(run_parallel(episode_features, jobs_to_do, jobs), total=len(jobs_to_do),
               desc="inputs", unit="episode", disable=None))
     data, dev = load_features(setup, train_seeds), load_features(setup, dev_seeds)
     loss = Loss(world.warm_up, *(modes[each] for each in ("basis", "rest")

@@ -27,7 +27,7 @@ from eitbench.measured.segmentation import (
     ktc_score,
     segment,
 )
-from eitbench.numerics.round import electrode_disc
+from eitbench.numerics.round_meshes import electrode_disc
 from eitbench.physics.cem import CompleteElectrodeModel
 from eitbench.worlds.vessels import RoundTank
 

@@ -11,7 +11,7 @@ from thesis.common import run_baseline
 
 from eitbench.data.seeds import parse_seeds
 from eitbench.envs.estimation import EstimationEnv
-from eitbench.worlds.streams import randomness
+from eitbench.worlds.random_streams import episode_streams
 
 ID = "eitbench/Pipe2DTimeVaryingVelocity-v0"
 EPISODES = parse_seeds("dev:0-7")
@@ -24,7 +24,7 @@ def main() -> None:
     world, task = env.world, env.task
     predicted, errors = [], []
     for seed in EPISODES:
-        flow = world.flow.draw(world, randomness(seed).flow)
+        flow = world.flow.draw(world, episode_streams(seed).flow)
         truth = np.array([flow(t).mean_velocity for t in range(1, task.n_steps + 1)])
         estimates = run_baseline(env, "joint_inflow_filter", seed)[task.warm_up:]
         mean, variance = (np.array([np.asarray(value)[0] for value in values]) for values in zip(

@@ -1,14 +1,14 @@
 """What makes two recordings the same, and what a process forgets of them."""
 
 
-from eitbench.data import cache, recordings
+from eitbench.data import cache, episode_cache
 
 
 def forget():
-    """Forget what a new process does not know: verified files, outlines and beginnings."""
+    """Forget what a new process does not know: verified files, scoring constants and prefixes."""
     cache._sound.clear()
-    recordings.outline.__wrapped__.cache_clear()
-    recordings._beginning.cache_clear()
+    episode_cache.scoring_constants.__wrapped__.cache_clear()
+    episode_cache._beginning.cache_clear()
 
 
 def forget_made(module):

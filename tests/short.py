@@ -27,8 +27,9 @@ TANK = {"vessel": {"n_electrodes": 8}, "schedule": {"warm_up": 1, "scored_steps"
 
 SHORT = {
     "Pipe2D": PIPE,
-    "Pipe2DInjectionFaults": merged(PIPE, {"instrument": {"dead": [0, 1], "failing": [0, 1], "loose": [0, 0]}}),
-    "Pipe2DIntermittent": merged(PIPE, {"target": {"arrivals": {"interval": 0.01, "wait": 0.001}}}),
+    "Pipe2DInjectionFaults": merged(PIPE, {"instrument": {
+        "n_dead_range": [0, 1], "n_failing_range": [0, 1], "n_loose_range": [0, 0]}}),
+    "Pipe2DIntermittent": merged(PIPE, {"target": {"arrivals": {"dead_time": 0.01, "mean_wait": 0.001}}}),
     "Pipe2DDriftingVelocity": WANDERING,
     "Pipe2DBiasedVelocity": FLOW,
     "Pipe2DUnknownVelocity": FLOW,
@@ -51,7 +52,7 @@ SHORT = {
 def world(name: str) -> dict:
     """Keyword arguments that make an id's episodes short."""
     each = entry(name).world
-    kind = "Pipe2DInjectionFaults" if each.instrument.most else each.name
+    kind = "Pipe2DInjectionFaults" if each.instrument.max_faulty else each.name
     assert kind in SHORT, f"{name} has no short version yet: give {kind!r} one in tests/short.py"
     return {"world": SHORT[kind]}
 
@@ -63,12 +64,13 @@ def short(name: str) -> dict:
 
 def register_apart(monkeypatch) -> None:
     """What is registered from now on is forgotten after the test."""
-    hands = {each.id for each in registry.registered_by_hand()}
+    hands = {each.id for each in registry.runtime_entries()}
     monkeypatch.setattr(registry, "_entries", registry.entries())
-    monkeypatch.setattr(registry, "_by_hand", hands)
+    monkeypatch.setattr(registry, "_runtime_ids", hands)
 
 
 def shorten(monkeypatch, changes: dict[str, dict]) -> None:
     """Let registered ids play other worlds, in other processes too: id -> changes of the world."""
     register_apart(monkeypatch)
-    registry.take_over([replace(entry(name), world=entry(name).world.changed(each)) for name, each in changes.items()])
+    registry.import_entries([replace(entry(name), world=entry(name).world.with_changes(each))
+                             for name, each in changes.items()])

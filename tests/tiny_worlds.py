@@ -7,6 +7,6 @@ from short import merged
 CHANGES = {"flow": {"mean_velocity": 45.0}, "vessel": {"electrodes_per_wall": 2},
            "schedule": {"scored_steps": 3, "pattern": {"frame": 2}}}
 """A fast fluid flushes the pipe in two steps: of five measurements the last three are scored."""
-TINY = PIPE_2D.changed(CHANGES)
+TINY = PIPE_2D.with_changes(CHANGES)
 FAST = merged(CHANGES, {"flow": {"velocity_range": [40.0, 50.0]}})
 """The same where the flow is drawn for each episode."""

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from eitbench.bench.methods import load_method
-from eitbench.data.recordings import recording
+from eitbench.data.episode_cache import cached_episode
 from eitbench.envs.injection_core import InjectionCore
 from eitbench.estimation.onboard.belief import Belief
 from eitbench.estimation.onboard.rules import Rules
@@ -77,10 +77,10 @@ class Policy:
         covariance = None
         faults = core.faults
         if self.rules.world.velocity_model is not None:
-            belief.told(recording(self.rules.world, core.seeds[0])[core.t - 1:])
+            belief.told(cached_episode(self.rules.world, core.seeds[0])[core.t - 1:])
         plan = np.empty(core.length, dtype=int)
         for k in range(core.length):
-            sound = (core.t + k + 1 < faults.broken_from[0]) & (faults.resistance[0] == 0.0)
+            sound = (core.t + k + 1 < faults.open_circuit_from[0]) & (faults.resistance[0] == 0.0)
             predicted = belief.predicted(covariance, k)
             weight = belief.foresight(horizon, k) if horizon else None
             plan[k] = belief.gains(predicted, sound, weight=weight)[0].argmax()

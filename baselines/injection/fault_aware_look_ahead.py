@@ -15,7 +15,7 @@ class Policy:
 
     @classmethod
     def suits(cls, rules: Rules) -> bool:
-        return rules.instrument.most > 0
+        return rules.instrument.max_faulty > 0
 
     def __init__(self, rules: Rules, random: np.random.Generator) -> None:
         self.rules = rules

@@ -18,8 +18,8 @@ from eitbench.bench.run import Job
 from eitbench.bench.scores import scored
 from eitbench.bench.suites import isolated_job
 from eitbench.bench.tracks import Environment
-from eitbench.data.parallel import in_parallel
-from eitbench.data.seeds import name_seed, parse_seeds
+from eitbench.data.parallel import run_parallel
+from eitbench.data.seeds import format_seed, parse_seeds
 
 
 def evaluate(method: Any, env: str | gym.Env, seeds: str | Iterable[int], *,
@@ -58,10 +58,10 @@ def evaluate(method: Any, env: str | gym.Env, seeds: str | Iterable[int], *,
     if not numbers:
         raise ValueError("seeds must name at least one episode, got none")
     work = [(asked, runner, seed) for seed in numbers]
-    played = in_parallel(_row, work, _check.integer("n_jobs", n_jobs, low=1))
+    played = run_parallel(_row, work, _check.integer("n_jobs", n_jobs, low=1))
     bar = tqdm(played, total=len(work), desc=_method(runner).name, unit="episode", disable=None)
     rows = {row["seed"]: row for row in bar}
-    return pd.DataFrame([rows[name_seed(seed)] for seed in dict.fromkeys(numbers)])
+    return pd.DataFrame([rows[format_seed(seed)] for seed in dict.fromkeys(numbers)])
 
 
 def _method(runner: Method | Job) -> Method:
@@ -74,9 +74,9 @@ def _row(asked: Environment, runner: Method | Job, seed: int) -> dict[str, Any]:
     try:
         outcome = play(asked, method, seed).outcome
     except Exception as error:
-        error.add_note(f"{method.name} on {asked.id}, {name_seed(seed)}")
+        error.add_note(f"{method.name} on {asked.id}, {format_seed(seed)}")
         raise
-    return {"environment": asked.name, "method": method.name, "seed": name_seed(seed),
+    return {"environment": asked.name, "method": method.name, "seed": format_seed(seed),
             **scored(method.track, outcome)}
 
 

@@ -31,19 +31,19 @@ from eitbench.bench.methods import (
     own_methods,
 )
 from eitbench.bench.scores import scored, scores
-from eitbench.data.episodes import Episode, truth_discretisation
-from eitbench.data.recordings import (
+from eitbench.data.episode_cache import (
+    build_cached_episode,
     cycle_voltages,
-    faults_of,
+    instrument_faults,
     integrals,
-    make_recording,
     score_mass,
     step_error,
 )
-from eitbench.data.seeds import name_seed, parse_seeds
+from eitbench.data.episodes import Episode, cached_truth_model
+from eitbench.data.seeds import format_seed, parse_seeds
 from eitbench.estimation import best_homogeneous
+from eitbench.worlds.random_streams import episode_streams
 from eitbench.worlds.registry import entry
-from eitbench.worlds.streams import randomness
 from eitbench.worlds.task import make_task
 from eitbench.worlds.world import World
 
@@ -212,7 +212,7 @@ def world_numbers(world: World, episodes: tuple[str, ...]) -> dict[str, Any]:
         ∫(c − background)², ∫c², moments of the flow, faults, ĉ_bh in mol/m³, and the mean relative
         error of that estimate.
     """
-    return {"model": _model_numbers(world.fluid),
+    return {"model": _model_numbers(world.truth_config),
             "episodes": {name: _episode_numbers(world, name) for name in episodes}}
 
 
@@ -264,8 +264,8 @@ def _shown_steps(n_steps: int) -> list[int]:
 @lru_cache(maxsize=4)
 def _episode(world: World, name: str) -> Episode:
     """Simulate a golden episode; 𝓡 is NaN at steps that the golden file does not use."""
-    truth = truth_discretisation(world)
-    random = randomness(parse_seeds(name)[0])
+    truth = cached_truth_model(world)
+    random = episode_streams(parse_seeds(name)[0])
     n_steps = min(WORLD_EPISODES[name] or world.n_steps, world.n_steps)
     used = sorted({*range(world.calibration), *_shown_steps(n_steps)})
     L = world.vessel.n_electrodes
@@ -279,23 +279,23 @@ def _episode(world: World, name: str) -> Episode:
 
 def _episode_numbers(world: World, name: str) -> dict[str, Any]:
     (seed,) = parse_seeds(name)
-    episode = _episode(world.fluid, name)
-    task = make_task(world.fluid)
+    episode = _episode(world.truth_config, name)
+    task = make_task(world.truth_config)
     L = world.vessel.n_electrodes
-    entries = make_recording(world, episode)
+    entries = build_cached_episode(world, episode)
     moments, deviations, squares = integrals(world, entries)
     voltages = cycle_voltages(world, seed, entries)
-    sound = cycle_voltages(world.sound, seed, entries)[:world.calibration]
+    sound = cycle_voltages(world.fault_free, seed, entries)[:world.calibration]
     cycle = world.currents[np.arange(world.calibration) % len(world.currents)]
     homogeneous = best_homogeneous(task.observation, world.noise, task.mesh.n_nodes, sound, cycle,
                                    world.expected_concentration)
     level = np.full(task.mesh.n_nodes, homogeneous - world.background)
     errors = [float(step_error(score_mass(world), level, moments[k], deviations[k], squares[k]))
               for k in range(world.warm_up, len(entries))]
-    faults = faults_of(world, seed)
+    faults = instrument_faults(world, seed)
     steps = _shown_steps(len(entries))
     numbers = {
-        "seed": name_seed(seed),
+        "seed": format_seed(seed),
         "resistance": entries["transfer_resistance"][steps][:, [0, 0, 1, L // 2],
                                                             [1, L // 2, L - 1, L // 2]],
         "noise": entries["noise"][steps][:, [0, L - 1]],
@@ -303,7 +303,7 @@ def _episode_numbers(world: World, name: str) -> dict[str, Any]:
         "moment": np.array([_sample(moments[k]) for k in steps]), "deviation": deviations[steps],
         "mean_moment": _sample(moments.mean(axis=0, dtype=float)),
         "square": squares[steps], "homogeneous": homogeneous, "floor": float(np.mean(errors)),
-        "broken_from": faults.broken_from, "loose": faults.resistance}
+        "broken_from": faults.open_circuit_from, "loose": faults.resistance}
     if world.velocity_model is not None:
         flow = entries["velocity_moment"][steps]
         numbers["velocity"] = np.column_stack([flow, entries["velocity_square"][steps]])

@@ -54,8 +54,8 @@ from eitbench.bench.methods import (
 )
 from eitbench.bench.tracks import BOARDS, Environment, is_measured
 from eitbench.data.cache import CACHE_VARIABLE, cache_folder, model_key
-from eitbench.worlds import streams
-from eitbench.worlds.registry import registered_by_hand, take_over
+from eitbench.worlds.random_streams import generator_from_state
+from eitbench.worlds.registry import import_entries, runtime_entries
 
 ISOLATE = ("auto", "none", "process", "bubblewrap")
 """Values of the option ``isolate``."""
@@ -434,7 +434,7 @@ class Worker:
     def _files(self, id: str, method: str) -> dict[str, np.ndarray]:
         """Return the name of the method, the contents of its files, and an entry that only a
         script has registered, as bytes."""
-        by_hand = [each for each in registered_by_hand() if each.id == id]
+        by_hand = [each for each in runtime_entries() if each.id == id]
         contents = {"method": str(method).encode(),
                     "entry": b"".join(map(cloudpickle.dumps, by_hand))}
         if is_path(method) and is_ours(method):
@@ -644,7 +644,7 @@ class _MethodServer:
         contents = {name: array.tobytes() for name, array in arrays.items()}
         method = contents["method"].decode()
         if contents["entry"]:  # from the trusted side
-            take_over([cloudpickle.loads(contents["entry"])])
+            import_entries([cloudpickle.loads(contents["entry"])])
         home = Path.home() / "method"
         home.mkdir()
         for name in (name for name in contents if name.startswith("file:")):
@@ -662,7 +662,7 @@ class _MethodServer:
     def begin(self, header: dict[str, Any], arrays: Arrays) -> tuple[dict[str, Any], Arrays]:
         """Make a new instance of the method."""
         random = header["random"]
-        drawn = [] if random is None else [streams.in_state(random)]
+        drawn = [] if random is None else [generator_from_state(random)]
         self._instance = self._method.make(self._known, *drawn)
         return {}, {}
 

@@ -13,7 +13,7 @@ import numpy as np
 from eitbench._files import write_atomically
 from eitbench.bench.scores import Outcome
 from eitbench.measured.segmentation import ktc_score, segment
-from eitbench.physics.rest import AtRest
+from eitbench.physics.stationary import StationaryTransport
 
 if TYPE_CHECKING:
     from eitbench.envs.measured import MeasuredEnv
@@ -68,7 +68,7 @@ class MeasuredRun:
         residual, nis = np.full(T, np.nan), np.full(T, np.nan)
         theta = None if velocity is None else np.tile(velocity.nominal, (T, 1))
         electrodes = _ElectrodeResiduals(env)
-        at_rest = isinstance(env.task.transport, AtRest)
+        at_rest = isinstance(env.task.transport, StationaryTransport)
         estimates: dict[int, Estimate] = {}
         seconds = 0.0
         mean = before = np.empty(0)

@@ -13,10 +13,10 @@ from eitbench._extras import needed_by
 from eitbench.bench.methods import Method, load_method
 from eitbench.bench.playing import policys_random
 from eitbench.bench.tracks import check_track
-from eitbench.data.bank import fill
-from eitbench.data.dataset import asked_seeds
+from eitbench.data.dataset import resolve_seeds
 from eitbench.data.export import WARNING
-from eitbench.data.seeds import for_scores, is_test, name_seed, seed_ranges
+from eitbench.data.presimulation import presimulate
+from eitbench.data.seeds import allow_test_seeds, format_seed, is_test, seed_ranges
 
 if TYPE_CHECKING:
     from minari.data_collector import EpisodeBuffer
@@ -40,20 +40,21 @@ def export_minari(name: str, env: str, policy: str, seeds: str | Sequence[int], 
     ``name`` is that of the data set, as in ``eitbench/pipe2d/random-pair-v0``; ``env`` the id of an
     injection environment; ``policy`` a built-in name, or the path of a file, which runs in this
     process; ``seeds`` as of `eitbench.dataset`, ``n_jobs`` and ``backend`` of
-    `eitbench.data.bank.fill`. ``ValueError`` for an unknown environment, policy or seed, a policy
+    `eitbench.data.presimulation.presimulate`. ``ValueError`` for an unknown environment, policy or
+    seed, a policy
     that does not suit the environment, or a name that is malformed or taken.
     """
     with needed_by("format minari"):
         from minari import create_dataset_from_buffers
     _check_name(name)
     check_track(env, "injection")
-    numbers = asked_seeds(seeds)
+    numbers = resolve_seeds(seeds)
     method = load_method(policy, "injection")
     made = gym.make(env)
     inner: Any = made.unwrapped
     if not method.suits(inner.rules):
         raise ValueError(f"policy must suit env, got {policy!r}, which does not")
-    fill(inner.world, numbers, n_jobs=n_jobs, backend=backend)
+    presimulate(inner.world, numbers, n_jobs=n_jobs, backend=backend)
     episodes = [_run(made, method, seed, k) for k, seed in enumerate(
         tqdm(numbers, desc="playing", unit="episode", disable=None))]
     # by its id: the spec of one that is made knows its length, and would be truncated there too
@@ -80,7 +81,7 @@ def _run(env: gym.Env[Any, Any], policy: Method, seed: int, number: int) -> Epis
     """Run one episode."""
     from minari.data_collector import EpisodeBuffer
     inner: Any = env.unwrapped
-    with for_scores():
+    with allow_test_seeds():
         observations = [env.reset(seed=seed)[0]]
     player = policy.make(inner.rules, policys_random(seed), *[inner.core] * policy.privileged)
     steps: list[tuple[Any, ...]] = []
@@ -99,5 +100,5 @@ def _run(env: gym.Env[Any, Any], policy: Method, seed: int, number: int) -> Epis
 def _description(env: str, policy: Method, seeds: Sequence[int]) -> str:
     from eitbench import __version__
     return DESCRIPTION.format(
-        env=env, policy=policy.name, title=policy.title, seeds=seed_ranges(map(name_seed, seeds)),
+        env=env, policy=policy.name, title=policy.title, seeds=seed_ranges(map(format_seed, seeds)),
         version=__version__, warning=WARNING if any(map(is_test, seeds)) else "").strip()

@@ -10,8 +10,8 @@ import numpy as np
 
 from eitbench import scoring
 from eitbench.bench.scores import Outcome
-from eitbench.data.episodes import simulate, truth_discretisation
-from eitbench.data.recordings import region_operators
+from eitbench.data.episode_cache import region_operators
+from eitbench.data.episodes import cached_truth_model, simulate
 from eitbench.envs.estimation import EstimationEnv
 from eitbench.estimation import best_homogeneous
 from eitbench.estimation.onboard.innovation import Innovation
@@ -110,7 +110,7 @@ def outcome_of(env: EstimationEnv, said: Said) -> Outcome:
     return Outcome(
         env.world, float(said.seconds.sum() / task.n_steps),
         scoring.step_errors(mean, truth, mass), mean=mean, truth=truth, mass=mass,
-        points=truth_discretisation(env.world).transport.mesh.points, homogeneous=homogeneous,
+        points=cached_truth_model(env.world).transport.mesh.points, homogeneous=homogeneous,
         measured=said.voltages[states], computed=computed,
         innovations=innovations, std=std, velocity=velocity)
 
@@ -140,5 +140,5 @@ def outcome_of_claims(world: World, seed: int, claims: list[Claim], seconds_per_
     return Outcome(
         world, seconds_per_step, np.array(errors), spent,
         mean=(interpolation @ np.array(means).T).T, truth=truth, mass=mass,
-        points=truth_discretisation(world).transport.mesh.points,
+        points=cached_truth_model(world).transport.mesh.points,
         innovations=both if used else None, std=(interpolation @ np.array(stds).T).T)

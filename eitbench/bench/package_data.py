@@ -9,7 +9,7 @@ import numpy as np
 
 from eitbench.bench.tracks import own_ids
 from eitbench.data.cache import PACKAGE_DATA, Arrays, File, load_shipped, ship
-from eitbench.data.recordings import beginning_file, csr_of, outline_file, region_file
+from eitbench.data.episode_cache import csr_of, prefix_file, region_file, scoring_constants_file
 from eitbench.estimation.onboard.models import packed_model, stored_model_key, unpacked
 from eitbench.worlds.registry import Entry, entries, entry
 
@@ -25,15 +25,15 @@ def expected_files(ids: Iterable[str]) -> list[File]:
 
 def _files(registered: Entry) -> Iterator[File]:
     world = registered.world
-    yield outline_file(world)
+    yield scoring_constants_file(world)
     if world.region is not None:
         yield region_file(world)
     needed = max(_needed_steps(each) for each in entries().values()
-                 if each.world.fluid == world.fluid)
+                 if each.world.truth_config == world.truth_config)
     if needed <= world.warm_up:
-        yield beginning_file(world, needed)
+        yield prefix_file(world, needed)
     if registered.track == "injection":
-        yield File(stored_model_key(world), lambda: packed_model(world.sound))
+        yield File(stored_model_key(world), lambda: packed_model(world.fault_free))
 
 
 def _needed_steps(registered: Entry) -> int:

@@ -18,13 +18,13 @@ from eitbench.bench.methods import Method, load_method
 from eitbench.bench.outcomes import Claim, Said, outcome_of, outcome_of_claims
 from eitbench.bench.scores import Outcome
 from eitbench.bench.tracks import Environment, board_of, check_track, is_measured
-from eitbench.data.seeds import for_scores
+from eitbench.data.seeds import allow_test_seeds
 from eitbench.envs.estimation import EstimationEnv
 from eitbench.envs.injection import InjectionEnv
 from eitbench.estimation.walk import RandomWalk
-from eitbench.physics.rest import AtRest
+from eitbench.physics.stationary import StationaryTransport
+from eitbench.worlds.random_streams import episode_streams, generator_from_state
 from eitbench.worlds.registry import entry
-from eitbench.worlds.streams import in_state, randomness
 from eitbench.worlds.task import Estimate, Task
 from eitbench.worlds.world import World
 
@@ -102,7 +102,7 @@ def run_on_measurements(env: MeasuredEnv, method: str | Method, seed: int = 0, *
 
 
 def _motion(task: Task) -> str:
-    if isinstance(task.transport, AtRest):
+    if isinstance(task.transport, StationaryTransport):
         return "stands still"
     if isinstance(task.transport, RandomWalk):
         return "walks at random"
@@ -139,7 +139,7 @@ def injections(env: InjectionEnv, policy: Method, seed: int, actions: list[Any] 
     actions."""
     if not policy.suits(env.rules):
         raise ValueError(f"policy {policy.name} does not suit {env.spec.id if env.spec else env}")
-    with for_scores():
+    with allow_test_seeds():
         observation, _ = env.reset(seed=seed)
     t = env.core.first
     random = policys_random(seed)
@@ -160,8 +160,8 @@ def injections(env: InjectionEnv, policy: Method, seed: int, actions: list[Any] 
 def policys_random(seed: int) -> np.random.Generator:
     """Return the generator that a policy draws from in the episode of this seed."""
     # A generator reveals its seed, so the policy's gets a state only.
-    drawn = np.random.default_rng(int(randomness(seed).policy.integers(2**63)))
-    return in_state(drawn.bit_generator.state)
+    drawn = np.random.default_rng(int(episode_streams(seed).policy.integers(2**63)))
+    return generator_from_state(drawn.bit_generator.state)
 
 
 def estimates(env: EstimationEnv, estimator: Method,
@@ -176,7 +176,7 @@ def estimates(env: EstimationEnv, estimator: Method,
 def _estimates(env: EstimationEnv | MeasuredEnv, estimator: Method, seed: int,
                ) -> Iterator[tuple[int, Estimate | None, dict[str, np.ndarray], float]]:
     """Yield (t = i − lag, estimate, measurement i, seconds the estimator took) at each step i."""
-    with for_scores():
+    with allow_test_seeds():
         observation, _ = env.reset(seed=seed)
     if estimator.privileged and not isinstance(env, EstimationEnv):
         raise ValueError(f"{estimator.name} needs the ground truth, which measurements do not have")
@@ -227,7 +227,7 @@ def _check_estimate(estimate: Any, task: Task, readings: int) -> None:
             if task.velocity is None:
                 raise ValueError(f"Estimate.{name} must be None where the flow is not asked for, "
                                  f"got {value!r}")
-            _check.array(f"Estimate.{name}", value, (task.velocity.size,))
+            _check.array(f"Estimate.{name}", value, (task.velocity.n_parameters,))
     if innovation is not None:
         _check.array("Estimate.innovation", innovation, (readings,), units="V")
     if covariance is not None:

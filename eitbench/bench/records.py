@@ -37,7 +37,7 @@ from eitbench._files import shipped, write_atomically
 from eitbench._foreign import cleaned
 from eitbench.bench import tracks
 from eitbench.bench.episode_table import read_episode_table, table_beside
-from eitbench.data.seeds import name_seed, parse_seeds
+from eitbench.data.seeds import format_seed, parse_seeds
 
 SCHEMA = 3
 BOARDS = tracks.ALL_BOARDS
@@ -323,9 +323,9 @@ def _of_the_seeds(record: dict[str, Any]) -> Iterator[str]:
 
 @lru_cache(maxsize=2**14)
 def _is_seed(seed: str) -> bool:
-    """Return whether a seed lies within its split and is written as `name_seed` does."""
+    """Return whether a seed lies within its split and is written as `format_seed` does."""
     try:
-        return name_seed(parse_seeds(seed)[0]) == seed
+        return format_seed(parse_seeds(seed)[0]) == seed
     except ValueError:
         return False
 

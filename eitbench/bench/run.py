@@ -28,8 +28,8 @@ from eitbench.bench.store import EpisodeStore, machine, portable_command, proven
 from eitbench.bench.tracks import Environment, board_of, is_measured, registered
 from eitbench.data.cache import world_digest
 from eitbench.data.episodes import simulate
-from eitbench.data.parallel import in_parallel
-from eitbench.data.seeds import name_seed
+from eitbench.data.parallel import run_parallel
+from eitbench.data.seeds import format_seed
 from eitbench.measured.cases import read_case
 from eitbench.worlds.registry import entry
 
@@ -79,7 +79,7 @@ def _content_digest(id: str, changes: dict[str, Any] | None) -> str:
     """Return the digest of an environment's world with ``changes``, or of its measured case."""
     if is_measured(id):
         return read_case(registered(id)["case"]).digest
-    return world_digest(entry(id).world.changed(changes))
+    return world_digest(entry(id).world.with_changes(changes))
 
 
 def run_episode(job: Job) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
@@ -117,7 +117,7 @@ def _beginning(job: Job, method: Method) -> dict[str, Any]:
     asked = job.environment
     own = ("title", "parameters", "role", "privileged", "version")
     return {
-        "identity": job.identity(), "seed": name_seed(job.seed), "method": method.name,
+        "identity": job.identity(), "seed": format_seed(job.seed), "method": method.name,
         **{name: getattr(method, name) for name in own}, "method_sha256": method.sha256,
         "checkpoint_sha256": method.sha256 if method.path.suffix == ".zip" else None,
         "board": board_of(environment(asked)),
@@ -143,7 +143,7 @@ def run_jobs(jobs: list[Job], store: EpisodeStore, *, n_jobs: int = 1, backend: 
     """Run all jobs that ``store`` does not hold yet, in ``n_jobs`` processes with one BLAS thread
     each, and store each episode when it is finished.
 
-    Clusters (``backend``, see `eitbench.data.parallel.in_parallel`) need the folders of ``store``
+    Clusters (``backend``, see `eitbench.data.parallel.run_parallel`) need the folders of ``store``
     and cache on all machines. Results name ``command``, without folders.
     """
     todo = [job for job in jobs
@@ -165,7 +165,7 @@ def run_jobs(jobs: list[Job], store: EpisodeStore, *, n_jobs: int = 1, backend: 
                         for job in todo],
              "running methods"),
         ):
-            done = in_parallel(function, work, n_jobs, backend)
+            done = run_parallel(function, work, n_jobs, backend)
             for _ in tqdm(done, total=len(work), desc=label, unit="episode", disable=None):
                 pass
     finally:
@@ -182,7 +182,7 @@ def successful(jobs: Iterable[Job],
             key = (result["environment"]["name"], result["method"], result["version"],
                    result["seed"])
             first.setdefault(key, result)
-    keys = {job: (job.environment.name, job.load().name, job.load().version, name_seed(job.seed))
+    keys = {job: (job.environment.name, job.load().name, job.load().version, format_seed(job.seed))
             for job in jobs}
     return {job: first[key] for job, key in keys.items() if key in first}
 

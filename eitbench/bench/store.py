@@ -35,7 +35,7 @@ from eitbench.bench.records import (
 )
 from eitbench.bench.scores import SCORING
 from eitbench.data import cache
-from eitbench.data.seeds import name_seed
+from eitbench.data.seeds import format_seed
 
 PACKAGES = ("eitbench", "numpy", "scipy", "gymnasium", "scikit-fem", "numba", "stable-baselines3",
             "sb3-contrib", "torch")
@@ -62,7 +62,7 @@ class EpisodeStore:
     def put(self, environment: str, method: str, seed: int, result: dict[str, Any],
             fields: dict[str, np.ndarray]) -> None:
         """Store one episode; the estimates first, so that a result is never without them."""
-        path = self._path(environment, method, name_seed(seed))
+        path = self._path(environment, method, format_seed(seed))
         if fields:
             content = io.BytesIO()
             np.savez_compressed(content, **fields)  # type: ignore[arg-type]
@@ -79,7 +79,7 @@ class EpisodeStore:
 
     def result(self, environment: str, method: str, seed: int) -> dict[str, Any]:
         """Return a stored result; ``ValueError`` if there is none, or it is damaged."""
-        return _read(self._path(environment, method, name_seed(seed)))
+        return _read(self._path(environment, method, format_seed(seed)))
 
     def results(self) -> Iterator[dict[str, Any]]:
         """Yield all stored results; a damaged file is left out with a warning that names it."""

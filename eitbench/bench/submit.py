@@ -11,7 +11,7 @@ from eitbench.bench.records import read_record, split_of, write_record
 from eitbench.bench.run import Job, run_jobs, unplayed
 from eitbench.bench.store import EpisodeStore, provenance, results_of
 from eitbench.bench.text import seed_ranges
-from eitbench.data.seeds import name_seed
+from eitbench.data.seeds import format_seed
 
 
 def submit(method: str | None, environments: list[str], seeds: list[int] | None,
@@ -36,7 +36,7 @@ def submit(method: str | None, environments: list[str], seeds: list[int] | None,
         raise ValueError("official must be False unless this is a commit without changes, got "
                          f"official=True {where}")
     split = "test"
-    outside = [name_seed(seed) for seed in seeds or [] if split_of(name_seed(seed)) != split]
+    outside = [format_seed(seed) for seed in seeds or [] if split_of(format_seed(seed)) != split]
     if outside:
         raise ValueError(f"seeds of a submission must be of the split {split}, got "
                          f"{', '.join(outside)}")

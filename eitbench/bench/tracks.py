@@ -77,7 +77,7 @@ class Environment(NamedTuple):
         """Return all arguments with which it is made, defaults included."""
         creator = load_env_creator(str(gym.spec(self.id).entry_point))
         defaults = {name: each.default for name, each in signature(creator).parameters.items()
-                    if each.default is not Parameter.empty}
+                    if each.default is not Parameter.empty and name != "variant"}
         return defaults | registered(self.id) | SCORED[self.track] | json.loads(self.kwargs)
 
     def make(self, **extra: Any) -> EstimationEnv | InjectionEnv:
@@ -118,7 +118,7 @@ def track_of(id: str) -> str:
 
 def home_of(id: str) -> str:
     """Return the id of which this one is a shifted variant, with the same task; else empty."""
-    return "" if is_measured(id) else entry(id).home
+    return "" if is_measured(id) else entry(id).nominal
 
 
 def check_track(id: str, track: str) -> None:
@@ -206,7 +206,7 @@ def class_of(id: str, board: str) -> str:
     if is_measured(id):
         return "measured"
     each = entries().get(id)
-    at_rest = each is not None and getattr(each.world.target, "stands_still", False)
+    at_rest = each is not None and getattr(each.world.target, "is_stationary", False)
     return "stationary" if at_rest else board
 
 
@@ -214,4 +214,4 @@ def default_seeds(id: str, suite: str = "full") -> list[int]:
     """Return the default seeds of an environment: test episodes."""
     if is_measured(id):
         return parse_seeds(MEASURED_SEEDS)
-    return parse_seeds(QUICK_SEEDS if suite == "quick" else entry(id).seeds)
+    return parse_seeds(QUICK_SEEDS if suite == "quick" else entry(id).test_seeds)

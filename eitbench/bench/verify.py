@@ -39,8 +39,8 @@ from eitbench.bench.store import EpisodeStore
 from eitbench.bench.table import Cell, Table
 from eitbench.bench.text import scores_by_seed
 from eitbench.bench.tracks import Environment
-from eitbench.data.cache import cache_in
-from eitbench.data.parallel import in_parallel
+from eitbench.data.cache import use_cache_dir
+from eitbench.data.parallel import run_parallel
 from eitbench.data.seeds import parse_seeds
 
 BUILTIN_FIELDS = ("method", "board", "role", "privileged")
@@ -98,9 +98,9 @@ def verify(paths: Sequence[Path], folder: Path, *, file: str | None = None, isol
             episode = record["episodes"][k]
             numbered = job and job._replace(seed=parse_seeds(episode["seed"])[0])
             cases.append(Case(record, episode, numbered))
-    with cache_in((folder / "cache").absolute()):
+    with use_cache_dir((folder / "cache").absolute()):
         if replay:
-            bar = tqdm(in_parallel(_replayed_row, [(case,) for case in cases], n_jobs, backend),
+            bar = tqdm(run_parallel(_replayed_row, [(case,) for case in cases], n_jobs, backend),
                        total=len(cases), desc="replaying", unit="episode", disable=None)
             rows += sorted(
                 bar, key=lambda row: (row["record"], len(row["episode"]), row["episode"]))

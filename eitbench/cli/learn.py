@@ -30,15 +30,15 @@ def bank(
     """
     import shutil
 
-    from eitbench.data.bank import fill, missing_seeds, recording_bytes
     from eitbench.data.cache import folder
+    from eitbench.data.presimulation import cached_episode_bytes, missing_seeds, presimulate
     from eitbench.data.seeds import parse_seeds
     from eitbench.worlds.registry import entry
     with options.clear_errors():
         numbers = parse_seeds(seeds)
         world = entry(env).world
     place = folder(world)
-    each = recording_bytes(world)
+    each = cached_episode_bytes(world)
     try:
         place.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -51,7 +51,7 @@ def bank(
         raise typer.BadParameter(f"seeds need {missing * each / 1e9:.1f} GB more, and "
                                  f"{free / 1e9:.1f} GB are free")
     with options.clear_errors():
-        made = fill(world, numbers, n_jobs=jobs, backend=backend)
+        made = presimulate(world, numbers, n_jobs=jobs, backend=backend)
     options.say(f"{made} simulated, {len(numbers) - made} were there")
 
 

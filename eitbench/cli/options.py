@@ -14,7 +14,7 @@ import typer
 from eitbench._extras import explained
 from eitbench._files import readable
 from eitbench._foreign import cleaned
-from eitbench.data.parallel import WorkerLost
+from eitbench.data.parallel import WorkerLostError
 
 CORES = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 Backend = StrEnum("Backend", ["loky", "ray", "dask"])
@@ -71,7 +71,7 @@ def clear_errors() -> Iterator[None]:
         yield
     except RuntimeError as error:
         from eitbench.bench.isolation import WorkerError
-        if not isinstance(error, WorkerLost | WorkerError):
+        if not isinstance(error, WorkerLostError | WorkerError):
             raise
         say(error, err=True)  # a traceback would show a stranger's words as they are
         raise typer.Exit(1) from error

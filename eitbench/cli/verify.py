@@ -107,10 +107,10 @@ def _held_out(paths: list[Path], folder: Path, method: str | None, isolate: str,
     from eitbench.bench.records import read_record
     from eitbench.bench.table import Table
     from eitbench.bench.verify import job_of, methods_beside
-    from eitbench.data.cache import cache_in
+    from eitbench.data.cache import use_cache_dir
     rows: list[dict[str, Any]] = []
     problems: list[str] = []
-    with cache_in(folder / "held-out"):
+    with use_cache_dir(folder / "held-out"):
         for path in paths:
             try:
                 record = read_record(path)

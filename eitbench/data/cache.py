@@ -26,7 +26,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from eitbench._files import PACKAGE, write_atomically
-from eitbench.worlds.fields import LATER
+from eitbench.worlds.fields import ADDED_LATER
+from eitbench.worlds.stored_names import STORED_NAMES, is_builtin, stored_names
 from eitbench.worlds.world import World
 
 CACHE_VARIABLE = "EITBENCH_CACHE"
@@ -68,8 +69,8 @@ class File(NamedTuple):
 
 
 def episode_key(world: World, name: str) -> Key:
-    """Return the key of arrays that depend on `World.fluid` and, by ``name``, on a seed."""
-    fluid = world.fluid
+    """Return the key of arrays that depend on `World.truth_config` and, by ``name``, on a seed."""
+    fluid = world.truth_config
     return Key(f"{fluid.name}-{world_digest(fluid)[:16]}", name)
 
 
@@ -91,7 +92,7 @@ def cached(key: Key, build: Callable[[], Arrays]) -> dict[str, np.ndarray]:
     try:
         store(key, built)
     except OSError as error:
-        warn_not_kept(key.path.parent, error)
+        warn_cache_unwritable(key.path.parent, error)
     return _fields(_record(built))
 
 
@@ -126,7 +127,7 @@ def load_shipped(key: Key) -> dict[str, np.ndarray] | None:
     return _fields(np.load(io.BytesIO(content))) if is_sound else None
 
 
-def warn_not_kept(place: Path, error: OSError) -> None:
+def warn_cache_unwritable(place: Path, error: OSError) -> None:
     """Warn that the cache cannot be written."""
     warnings.warn(f"episodes cannot be kept in {place} ({error}) and will be simulated again; "
                   f"${CACHE_VARIABLE} names another folder", stacklevel=3)
@@ -140,7 +141,7 @@ def cache_folder() -> Path:
 
 
 @contextmanager
-def cache_in(folder: Path) -> Iterator[None]:
+def use_cache_dir(folder: Path) -> Iterator[None]:
     """Use another cache folder within, also in processes that are started there."""
     before = os.environ.get(CACHE_VARIABLE)
     os.environ[CACHE_VARIABLE] = str(folder)
@@ -158,29 +159,30 @@ def folder(world: World) -> Path:
     return episode_key(world, "").path.parent
 
 
-def described(part: Any) -> Any:
-    """Return a dataclass as JSON: its class and its fields.
+def config_dict(part: Any) -> Any:
+    """Return a dataclass as JSON: its class and its fields, by the names in stored keys.
 
-    Built-in classes are named without their module, which may change; third-party ones with it,
-    and with their ``simulation_version``, if they declare one. Fields added later (`LATER`) are
-    left out at their default.
+    Built-in classes are named without their module, which may change. Third-party classes are
+    named with it, and with their ``simulation_version``, if they declare one. Fields added later
+    (`ADDED_LATER`) are omitted at their default.
     """
     if not is_dataclass(part):
         return list(part) if isinstance(part, tuple) else part
     kind = type(part)
-    is_builtin = kind.__module__.partition(".")[0] == "eitbench"
-    name = kind.__qualname__ if is_builtin else f"{kind.__module__}.{kind.__qualname__}"
+    name = kind.__qualname__
+    name = STORED_NAMES.get(name, name) if is_builtin(kind) else f"{kind.__module__}.{name}"
     version = getattr(kind, "simulation_version", None)
-    values = {each.name: described(value) for each in fields(part)
+    names = stored_names(kind)
+    values = {names[each.name]: config_dict(value) for each in fields(part)
               if not ((value := getattr(part, each.name)) == each.default
-                      and each.metadata == LATER)}
+                      and each.metadata == ADDED_LATER)}
     return {"kind": name} | ({} if version is None else {"simulation_version": version}) | values
 
 
 @lru_cache(maxsize=64)
 def world_digest(world: World) -> str:
     """Return a digest of all of a world that a score depends on."""
-    return _digest([described(world), SIMULATION])
+    return _digest([config_dict(world), SIMULATION])
 
 
 def _digest(configuration: Any) -> str:

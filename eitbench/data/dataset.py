@@ -1,7 +1,8 @@
 """Episodes as examples to learn from: measurements, and the true concentration.
 
 The truth is given on the estimators' nodes, as the concentration p_t nearest to it in the norm of
-the score. With M̃ and b_t of `eitbench.data.recordings`, M̃ p_t = b_t, and for every ĉ on these nodes
+the score. With M̃ and b_t of `eitbench.data.episode_cache`, M̃ p_t = b_t, and for every ĉ on these
+nodes
     ∫(ĉ − c_t)² = (ĉ − p_t)ᵀ M̃ (ĉ − p_t) + ∫(p_t − c_t)².
 In reduced coordinates, ĉ = c̄ + B â and G = Bᵀ M̃ B, with a_t nearest to the truth, likewise
     ∫(c̄ + B â − c_t)² = (â − a_t)ᵀ G (â − a_t) + ∫(c̄ + B a_t − c_t)².
@@ -21,10 +22,16 @@ from tqdm import tqdm
 
 from eitbench import _check
 from eitbench._extras import needed_by
-from eitbench.data.bank import TOGETHER, fill_here
-from eitbench.data.episodes import once
-from eitbench.data.recordings import cycle_voltages, integrals, outline, recording, score_mass
-from eitbench.data.seeds import is_test, name_seed, parse_seeds
+from eitbench.data.episode_cache import (
+    cached_episode,
+    cycle_voltages,
+    integrals,
+    score_mass,
+    scoring_constants,
+)
+from eitbench.data.episodes import cache_per_truth
+from eitbench.data.presimulation import BATCH_SIZE, presimulate_inline
+from eitbench.data.seeds import format_seed, is_test, parse_seeds
 from eitbench.worlds.registry import entry
 from eitbench.worlds.world import World
 
@@ -79,9 +86,9 @@ class Dataset:
         return len(self.seeds)
 
     def __iter__(self) -> Iterator[Example]:
-        for k in range(0, len(self.seeds), TOGETHER):
-            group = self.seeds[k:k + TOGETHER]
-            fill_here(self.world, group)
+        for k in range(0, len(self.seeds), BATCH_SIZE):
+            group = self.seeds[k:k + BATCH_SIZE]
+            presimulate_inline(self.world, group)
             yield from map(self.example, group)
 
     def __getitem__(self, index: int) -> Example:
@@ -90,7 +97,7 @@ class Dataset:
     def example(self, seed: int) -> Example:
         """Return the example of one episode, which is simulated if the cache does not hold it."""
         world = self.world
-        entries = recording(world, seed)
+        entries = cached_episode(world, seed)
         cycle = world.currents
         velocity = world.velocity_model
         flow = np.empty((len(entries), 0)) if velocity is None else (
@@ -98,9 +105,9 @@ class Dataset:
         nodal = Example(seed, cycle_voltages(world, seed, entries),
                         cycle[np.arange(world.n_steps) % len(cycle)], *_projected(world, entries),
                         flow)
-        return nodal if self.basis is None else self.of(nodal)
+        return nodal if self.basis is None else self.project_example(nodal)
 
-    def of(self, example: Example) -> Example:
+    def project_example(self, example: Example) -> Example:
         """Return an example on the nodes in these coordinates."""
         deviation = example.truth.astype(float) - self.mean
         a = np.linalg.solve(self.mass, self._weighted.T @ deviation.T).T
@@ -111,7 +118,7 @@ class Dataset:
     @property
     def mesh(self) -> Mesh:
         """Mesh of the nodes."""
-        return self.world.vessel.carrier(fine=False)[0]  # type: ignore[no-any-return]
+        return self.world.vessel.transport_mesh(fine=False)[0]  # type: ignore[no-any-return]
 
     @property
     def warm_up(self) -> int:
@@ -121,7 +128,7 @@ class Dataset:
     @cached_property
     def mass(self) -> Any:
         """Sparse M̃ (n, n) in m² (m³ in 3D): ∫f² = fᵀ M̃ f of nodal values f, over what counts; or
-        G (q, q) in (mol/m³)²·m², the identity for a basis of `modes`."""
+        G (q, q) in (mol/m³)²·m², the identity for a basis of `pod_modes`."""
         if self.basis is None:
             return self._nodal_mass
         gram = self._columns.T @ self._weighted
@@ -134,18 +141,18 @@ class Dataset:
         off = estimate - example.truth
         return (np.einsum("tn,nt->t", off, self.mass @ off.T) + example.unresolved) / example.square
 
-    def modes(self, q: int) -> np.ndarray:
+    def pod_modes(self, q: int) -> np.ndarray:
         """Return the best basis (n, q), in the norm of the score, for the scored states relative to
         the background; orthonormal in that norm. ``ValueError`` if they have fewer modes."""
-        return strongest(self, q)[0]
+        return pod_basis(self, q)[0]
 
-    def reduced(self, basis: np.ndarray, mean: float | np.ndarray | None = None) -> Dataset:
+    def project(self, basis: np.ndarray, mean: float | np.ndarray | None = None) -> Dataset:
         """Return the same examples in coordinates a, c = mean + basis a, with exact scores.
 
         Parameters
         ----------
         basis : (n, q) array, mol/m³
-            Such as `modes`. ``ValueError`` if its columns depend on each other.
+            Such as `pod_modes`. ``ValueError`` if its columns depend on each other.
         mean : float or (n,) array, mol/m³
             Default: the world's background.
         """
@@ -183,7 +190,7 @@ class Dataset:
     @property
     def _columns(self) -> np.ndarray:
         if self.basis is None:
-            raise ValueError("coordinates are those of `Dataset.reduced`, which has a basis")
+            raise ValueError("coordinates are those of `Dataset.project`, which has a basis")
         return self.basis
 
     @cached_property
@@ -220,17 +227,17 @@ def dataset(env: str, seeds: str | Sequence[int], *,
         As in ``"train:0-199"``, or the seeds themselves. Test episodes, on which methods are
         scored, require that their split is named: ``"test:0-9"``.
     world : dict, optional
-        Numbers of the world's parts to change; see `World.changed`.
+        Numbers of the world's parts to change; see `World.with_changes`.
 
     Raises
     ------
     ValueError
         For an unknown environment, number or seed, or a test episode without its split.
     """
-    return Dataset(env, entry(env).world.changed(world), asked_seeds(seeds))
+    return Dataset(env, entry(env).world.with_changes(world), resolve_seeds(seeds))
 
 
-def asked_seeds(seeds: str | Sequence[int]) -> tuple[int, ...]:
+def resolve_seeds(seeds: str | Sequence[int]) -> tuple[int, ...]:
     """Return each seed once; ``ValueError`` for none, or a test episode without its split."""
     numbers = parse_seeds(seeds) if isinstance(seeds, str) else [
         _check.integer("seeds", seed, low=0) for seed in seeds]
@@ -239,13 +246,12 @@ def asked_seeds(seeds: str | Sequence[int]) -> tuple[int, ...]:
     named = isinstance(seeds, str) and ":" in seeds
     if not named and (tests := [seed for seed in numbers if is_test(seed)]):
         raise ValueError("seeds must name the split of test episodes, on which methods are scored: "
-                         f"'{name_seed(tests[0])}', got {tests[0]}")
+                         f"'{format_seed(tests[0])}', got {tests[0]}")
     return tuple(dict.fromkeys(numbers))
 
 
-def strongest(examples: Dataset, q: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return `Dataset.modes`, and the mean square (n,) in (mol/m³)² of what they leave of c less
-    the background."""
+def pod_basis(examples: Dataset, q: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return `Dataset.pod_modes`, and the mean square (n,) of the projection error in (mol/m³)²."""
     n = examples.mesh.n_nodes
     q = _check.integer("q", q, low=1, high=n)
     second = np.zeros((n, n))
@@ -282,13 +288,13 @@ def _projected(world: World, entries: np.ndarray) -> tuple[np.ndarray, np.ndarra
     return (world.background + truth).astype(np.float32), unresolved, np.array(counted.square)
 
 
-@once(4)
+@cache_per_truth(4)
 def _solver(world: World) -> Any:
     """Return b (n, T) -> M̃⁻¹ b over the whole vessel."""
-    return splu(_symmetric(outline(world).mass).tocsc()).solve
+    return splu(_symmetric(scoring_constants(world).mass).tocsc()).solve
 
 
-@once(4)
+@cache_per_truth(4)
 def _region_solver(world: World) -> tuple[np.ndarray, Any]:
     """Return the nodes that the world's region touches, and M̃⁻¹ of them."""
     mass = _symmetric(score_mass(world))

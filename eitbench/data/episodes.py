@@ -17,11 +17,11 @@ from eitbench import _check
 from eitbench._notice import Wait
 from eitbench.data.cache import Key, cached, episode_key
 from eitbench.worlds.instrument import Faults
-from eitbench.worlds.streams import randomness
+from eitbench.worlds.random_streams import episode_streams
 from eitbench.worlds.world import Discretisation, World
 
 Made = TypeVar("Made")
-BEFOREHAND = "`eitbench bank --env ID --seeds train:0-99` makes episodes beforehand"
+PRESIMULATE_HINT = "`eitbench bank --env ID --seeds train:0-99` makes episodes beforehand"
 """What to say to those who wait for one."""
 
 
@@ -63,7 +63,7 @@ def simulate(world: World, seed: int, *, cache: bool = True, progress: bool = Tr
     seed = _check.integer("seed", seed, low=0)
 
     def build() -> dict[str, Any]:
-        return next(simulate_together(world, [seed], progress))._asdict()
+        return next(simulate_batch(world, [seed], progress))._asdict()
 
     if not cache:
         return Episode(**build())
@@ -79,34 +79,34 @@ def _key(world: World, seed: int) -> Key:
     return episode_key(world, f"{seed}.truth")
 
 
-def once(many: int) -> Callable[[Callable[[World], Made]], Callable[[World], Made]]:
+def cache_per_truth(many: int) -> Callable[[Callable[[World], Made]], Callable[[World], Made]]:
     """Decorate a function of a world: it runs once a process for all worlds with the same
-    `World.fluid`, and results of ``many`` are kept."""
+    `World.truth_config`, and results of ``many`` are kept."""
     def decorated(make: Callable[[World], Made]) -> Callable[[World], Made]:
         kept = lru_cache(maxsize=many)(make)
-        return wraps(kept)(lambda world: kept(world.fluid))
+        return wraps(kept)(lambda world: kept(world.truth_config))
 
     return decorated
 
 
-@once(4)
-def truth_discretisation(world: World) -> Discretisation:
-    """``world.truth()``."""
-    return world.truth()
+@cache_per_truth(4)
+def cached_truth_model(world: World) -> Discretisation:
+    """``world.truth_model()``."""
+    return world.truth_model()
 
 
-def simulate_together(world: World, seeds: Sequence[int], progress: bool = True,
+def simulate_batch(world: World, seeds: Sequence[int], progress: bool = True,
                       last: int | None = None) -> Iterator[Episode]:
     """Simulate several seeds, with the bits of `simulate`, up to the state ``last`` (default: all).
 
     In one flow eight episodes take the time of two.
     """
-    truth = truth_discretisation(world)
+    truth = cached_truth_model(world)
     label = f"simulating {world.name}, seed {', '.join(map(str, seeds))}"
     electrodes = truth.observation.cem.n_electrodes
     steps = world.n_steps if last is None else last
-    total = (world.lead_in + 2 * steps) * len(seeds)
-    wait = Wait(label, total, BEFOREHAND)
+    total = (world.spin_up_steps + 2 * steps) * len(seeds)
+    wait = Wait(label, total, PRESIMULATE_HINT)
     with tqdm(total=total, desc=label, unit="step", leave=False,
               disable=None if progress else True) as bar:
         def tick(steps: int) -> None:
@@ -114,7 +114,7 @@ def simulate_together(world: World, seeds: Sequence[int], progress: bool = True,
             if progress:
                 wait.tick(steps)
 
-        streams = [randomness(seed) for seed in seeds]
+        streams = [episode_streams(seed) for seed in seeds]
         for history, random in zip(world.evolve(streams, truth, tick, steps), streams, strict=True):
             noise = random.noise.standard_normal((world.n_steps, electrodes))[:steps]
             observation = world.true_observation(truth, random.contacts)

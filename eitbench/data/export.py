@@ -13,11 +13,11 @@ from tqdm import tqdm
 
 from eitbench._extras import needed_by
 from eitbench._files import PACKAGE, write_atomically
-from eitbench.data.bank import fill
-from eitbench.data.cache import described, world_digest
+from eitbench.data.cache import config_dict, world_digest
 from eitbench.data.dataset import Dataset
-from eitbench.data.recordings import SPARSE
-from eitbench.data.seeds import is_test, name_seed, parse_seeds, seed_ranges
+from eitbench.data.episode_cache import CSR_ARRAYS
+from eitbench.data.presimulation import presimulate
+from eitbench.data.seeds import format_seed, is_test, parse_seeds, seed_ranges
 
 SUFFIXES = {"npz": "npz", "hdf5": "h5"}
 """Format -> suffix of its files."""
@@ -43,7 +43,7 @@ def export(examples: Dataset, folder: Path, format: str = "npz", *, n_jobs: int 
     format : "npz" or "hdf5"
         hdf5 needs the extra ``export``; otherwise ``ModuleNotFoundError``.
     n_jobs, backend
-        Of the simulation; see `eitbench.data.bank.fill`.
+        Of the simulation; see `eitbench.data.presimulation.presimulate`.
     """
     if format not in SUFFIXES:
         raise ValueError(f"format must be one of {', '.join(SUFFIXES)}, got {format!r}")
@@ -54,16 +54,16 @@ def export(examples: Dataset, folder: Path, format: str = "npz", *, n_jobs: int 
             import h5py  # noqa: F401
     encode = _hdf5 if format == "hdf5" else _npz
     about = _about(examples, format)
-    _claim(folder, json.dumps(about, indent=1) + "\n")
+    _check_or_write_manifest(folder, json.dumps(about, indent=1) + "\n")
     suffix = SUFFIXES[format]
-    paths = {seed: folder / f"{name_seed(seed).replace(':', '-')}.{suffix}"
+    paths = {seed: folder / f"{format_seed(seed).replace(':', '-')}.{suffix}"
              for seed in examples.seeds}
     missing = [seed for seed, path in paths.items() if not path.exists()]
-    fill(examples.world, missing, n_jobs=n_jobs, backend=backend)
+    presimulate(examples.world, missing, n_jobs=n_jobs, backend=backend)
     mass = examples.mass
     write_atomically(folder / MESH, _npz(
         {"points": examples.mesh.points, "cells": examples.mesh.cells}
-        | {f"mass_{name}": getattr(mass, name) for name in SPARSE}))
+        | {f"mass_{name}": getattr(mass, name) for name in CSR_ARRAYS}))
     for seed in tqdm(missing, desc="writing", unit="episode", disable=None):
         write_atomically(paths[seed], encode(examples.example(seed)._asdict()))
     held = [path.stem.replace("-", ":") for path in folder.glob(f"[!.]*.{suffix}")
@@ -84,11 +84,11 @@ def _about(examples: Dataset, format: str) -> dict[str, Any]:
     return {"environment": examples.env, "format": format, "eitbench": __version__,
             "digest": world_digest(world), "steps": world.n_steps, "warm_up": world.warm_up,
             "time_step": world.time_step, "electrodes": world.vessel.n_electrodes,
-            "nodes": examples.mesh.n_nodes, "velocity": 0 if flow is None else flow.size,
-            "world": described(world)}
+            "nodes": examples.mesh.n_nodes, "velocity": 0 if flow is None else flow.n_parameters,
+            "world": config_dict(world)}
 
 
-def _claim(folder: Path, manifest: str) -> None:
+def _check_or_write_manifest(folder: Path, manifest: str) -> None:
     """Write the manifest into a new folder; ``ValueError`` if the folder holds other files."""
     path = folder / "dataset.json"
     if path.exists():

@@ -16,7 +16,7 @@ from typing import Any, TypeVar
 
 from tqdm import tqdm
 
-from eitbench.worlds.registry import Entry, registered_by_hand, take_over
+from eitbench.worlds.registry import Entry, import_entries, runtime_entries
 
 BACKENDS = ("loky", "ray", "dask")
 """Joblib on this machine, or a cluster."""
@@ -24,17 +24,17 @@ BACKENDS = ("loky", "ray", "dask")
 Result = TypeVar("Result")
 
 
-class WorkerLost(RuntimeError):
+class WorkerLostError(RuntimeError):
     """A process ended before its work was done."""
 
 
-def in_parallel(function: Callable[..., Result], arguments: Sequence[tuple], n_jobs: int,
+def run_parallel(function: Callable[..., Result], arguments: Sequence[tuple], n_jobs: int,
                 backend: str = "loky") -> Iterator[Result]:
     """Yield results of ``function(*each)`` in the order of completion.
 
     ``ray`` and ``dask`` use the cluster of $RAY_ADDRESS or $DASK_SCHEDULER_ADDRESS, and without one
     ``n_jobs`` processes here; another process repeats the work of a killed one. With loky that is a
-    `WorkerLost`. ``ValueError`` for an unknown backend, or one that is not installed.
+    `WorkerLostError`. ``ValueError`` for an unknown backend, or one that is not installed.
     """
     if backend not in BACKENDS:
         raise ValueError(f"backend must be one of {', '.join(BACKENDS)}, got {backend!r}")
@@ -59,12 +59,12 @@ def _with_joblib(function: Callable[..., Result], arguments: Sequence[tuple], n_
                             r"joblib\.externals\.loky\.")
     try:
         with config or nullcontext(), Parallel(n_jobs=n_jobs, **how) as parallel:
-            told = registered_by_hand()
+            told = runtime_entries()
             here = os.getpid()
-            yield from parallel(delayed(_watched)(here, told, function, *each)
+            yield from parallel(delayed(_run_with_parent_watchdog)(here, told, function, *each)
                                 for each in arguments)
     except lost as error:
-        raise _explained(error) from error
+        raise _worker_lost_error(error) from error
 
 
 def _with_dask(function: Callable[..., Result], arguments: Sequence[tuple], n_jobs: int,
@@ -88,8 +88,9 @@ def _with_ray(function: Callable[..., Result], arguments: Sequence[tuple], n_job
     if ours := not ray.is_initialized():
         ray.init(log_to_driver=False, **here)
     try:
-        told = registered_by_hand()
-        waiting = [ray.remote(_heard).remote(told, function, *each) for each in arguments]
+        told = runtime_entries()
+        remote = ray.remote(_run_capturing_stderr)
+        waiting = [remote.remote(told, function, *each) for each in arguments]
         while waiting:
             (done,), waiting = ray.wait(waiting)
             result, written = ray.get(done)
@@ -97,28 +98,28 @@ def _with_ray(function: Callable[..., Result], arguments: Sequence[tuple], n_job
                 tqdm.write(written, file=sys.stderr, end="")
             yield result
     except (WorkerCrashedError, NodeDiedError, OutOfMemoryError) as error:
-        raise _explained(error) from error
+        raise _worker_lost_error(error) from error
     finally:
         if ours:
             ray.shutdown()
 
 
-def _explained(error: BaseException) -> WorkerLost:
-    return WorkerLost("a process was lost, killed perhaps for want of memory "
+def _worker_lost_error(error: BaseException) -> WorkerLostError:
+    return WorkerLostError("a process was lost, killed perhaps for want of memory "
                       f"({type(error).__name__}); what was finished is kept, and the same command "
                       "goes on from there")
 
 
-def _watched(host: int, told: list[Entry], function: Callable[..., Result], *arguments: Any,
-             ) -> Result:
-    """Call `_pinned` in a process that ends soon after ``host``, its parent."""
+def _run_with_parent_watchdog(host: int, told: list[Entry], function: Callable[..., Result],
+                              *arguments: Any) -> Result:
+    """Call `_run_single_threaded` in a process that ends soon after ``host``, its parent."""
     if os.getppid() == host:
-        _end_with(host)
-    return _pinned(told, function, *arguments)
+        _exit_when_parent_dies(host)
+    return _run_single_threaded(told, function, *arguments)
 
 
 @lru_cache(maxsize=1)
-def _end_with(host: int) -> None:
+def _exit_when_parent_dies(host: int) -> None:
     """End this process within a second of its parent. (Linux's own signal would come as soon as the
     thread ends that has started it.)"""
     def look() -> None:
@@ -129,17 +130,18 @@ def _end_with(host: int) -> None:
     Thread(target=look, daemon=True, name="end with the host").start()
 
 
-def _heard(told: list[Entry], function: Callable[..., Result], *arguments: Any,
+def _run_capturing_stderr(told: list[Entry], function: Callable[..., Result], *arguments: Any,
            ) -> tuple[Result, str]:
-    """Return the result of `_pinned`, and what was written to standard error."""
+    """Return the result of `_run_single_threaded`, and what was written to standard error."""
     written = io.StringIO()
     with redirect_stderr(written):
-        return _pinned(told, function, *arguments), written.getvalue()
+        return _run_single_threaded(told, function, *arguments), written.getvalue()
 
 
-def _pinned(told: list[Entry], function: Callable[..., Result], *arguments: Any) -> Result:
+def _run_single_threaded(told: list[Entry], function: Callable[..., Result],
+                         *arguments: Any) -> Result:
     """Call a function in another process, which takes over the worlds that a script registered."""
     from threadpoolctl import threadpool_limits
-    take_over(told)
+    import_entries(told)
     with threadpool_limits(1):
         return function(*arguments)

@@ -9,7 +9,7 @@ from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
 
-OURS = ("eitbench", "gymnasium")
+INTERNAL_PACKAGES = ("eitbench", "gymnasium")
 """Packages whose lines no user wrote."""
 SPLITS = {"train": range(0, 100_000), "dev": range(100_000, 200_000),
           "test": range(200_000, 300_000)}
@@ -38,7 +38,7 @@ def parse_seeds(text: str) -> list[int]:
     return list(dict.fromkeys(seeds))
 
 
-def name_seed(seed: int) -> str:
+def format_seed(seed: int) -> str:
     """``test:4`` for the seed that `parse_seeds` makes of it; ``300017`` outside the splits."""
     for split, seeds in SPLITS.items():
         if seed in seeds:
@@ -70,23 +70,24 @@ class ReservedSeedWarning(UserWarning):
     """Somebody plays an episode of which scores are reported."""
 
 
-_FOR_SCORES = ContextVar("for_scores", default=False)
+_FOR_SCORES = ContextVar("allow_test_seeds", default=False)
 
 
-def warn_of_reserved(seeds: Iterable[int]) -> None:
+def warn_test_seeds(seeds: Iterable[int]) -> None:
     """A `ReservedSeedWarning`, which Python shows once a line of the user's, if one of these
-    episodes is of the test split and nobody said that it is played `for_scores`."""
+    episodes is of the test split and nobody said that it is played `allow_test_seeds`."""
     if _FOR_SCORES.get():
         return
     if reserved := [seed for seed in seeds if is_test(seed)]:
-        warnings.warn(f"reset(seed={reserved[0]}) began a test episode, {name_seed(reserved[0])}, "
-                      "on which methods are scored: what was trained or chosen on it has no fair "
-                      f"score; choose on dev seeds, from {SPLITS['dev'][0]}",
-                      ReservedSeedWarning, stacklevel=_users_level())
+        warnings.warn(f"reset(seed={reserved[0]}) began a test episode, "
+                      f"{format_seed(reserved[0])}, on which methods are scored; a method "
+                      "trained or chosen on it has no valid score; choose on dev seeds, "
+                      f"from {SPLITS['dev'][0]}",
+                      ReservedSeedWarning, stacklevel=_user_stacklevel())
 
 
 @contextmanager
-def for_scores() -> Iterator[None]:
+def allow_test_seeds() -> Iterator[None]:
     """Within, test episodes are played as they are meant to be."""
     token = _FOR_SCORES.set(True)
     try:
@@ -95,12 +96,12 @@ def for_scores() -> Iterator[None]:
         _FOR_SCORES.reset(token)
 
 
-def _users_level() -> int:
+def _user_stacklevel() -> int:
     """The ``stacklevel`` of the first caller that is neither of this package nor of gymnasium, for
     a warning that the caller of this function gives."""
     level = 1
     frame = sys._getframe(1)
-    while frame.f_back and frame.f_globals.get("__name__", "").split(".")[0] in OURS:
+    while frame.f_back and frame.f_globals.get("__name__", "").split(".")[0] in INTERNAL_PACKAGES:
         frame = frame.f_back
         level += 1
     return level

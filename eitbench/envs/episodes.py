@@ -20,9 +20,9 @@ from gymnasium.vector.utils import batch_space
 
 from eitbench import _check
 from eitbench._extras import needed_by
-from eitbench.data.bank import Pool
-from eitbench.data.recordings import concentration_at, recording, recording_so_far
-from eitbench.data.seeds import warn_of_reserved
+from eitbench.data.episode_cache import cached_episode, cached_episode_prefix, concentration_at
+from eitbench.data.presimulation import EpisodeSampler
+from eitbench.data.seeds import warn_test_seeds
 from eitbench.worlds.task import Task, make_task
 
 if TYPE_CHECKING:
@@ -66,9 +66,9 @@ class EpisodeCore(ABC):
         self.seeds = tuple(seeds)
         self._provide = provide
         if provide is None:
-            self._load([recording(self.world, seed) for seed in seeds])
+            self._load([cached_episode(self.world, seed) for seed in seeds])
         else:
-            self._load([recording_so_far(self.world, seed, self.first + 1) for seed in seeds])
+            self._load([cached_episode_prefix(self.world, seed, self.first + 1) for seed in seeds])
 
     def _load(self, recordings: Sequence[np.ndarray]) -> None:
         self._known = min(map(len, recordings))
@@ -81,7 +81,7 @@ class EpisodeCore(ABC):
             assert self._provide is not None
             for seed in self.seeds:
                 self._provide(self.world, seed)
-            self._load([recording(self.world, seed) for seed in self.seeds])
+            self._load([cached_episode(self.world, seed) for seed in self.seeds])
 
     @abstractmethod
     def _read(self, recordings: Sequence[np.ndarray]) -> None:
@@ -144,7 +144,7 @@ class EpisodeEnv(FixedLengthEnv):
 
     def __init__(self, core: EpisodeCore, episodes: int | None, render_mode: str | None) -> None:
         self.check_render(render_mode)
-        self.pool = Pool(episodes)
+        self.pool = EpisodeSampler(episodes)
         """training episodes of unseeded resets"""
         self.core = core
         """simulates the episode; its results include the ground truth"""
@@ -170,10 +170,10 @@ class EpisodeEnv(FixedLengthEnv):
         """Begin the episode with this seed (`eitbench.data.seeds`), or a random training one."""
         super().reset(seed=seed)
         if seed is not None:
-            self.pool.restart()
-        number = self.pool.draw(self.np_random) if seed is None else seed
-        warn_of_reserved([number])
-        self.core.begin([number], self.pool.provide)
+            self.pool.reset()
+        number = self.pool.sample_seed(self.np_random) if seed is None else seed
+        warn_test_seeds([number])
+        self.core.begin([number], self.pool.ensure_simulated)
         self._step = 1
         return self._observe(), {"step": 1}
 
@@ -214,8 +214,8 @@ class EpisodeEnv(FixedLengthEnv):
 
     def truth_mesh(self) -> Mesh:
         """Return the mesh of the ground truth."""
-        from eitbench.data.episodes import truth_discretisation
-        return truth_discretisation(self.world).transport.mesh
+        from eitbench.data.episodes import cached_truth_model
+        return cached_truth_model(self.world).transport.mesh
 
     def require_reset(self, caller: str) -> None:
         """Raise ``ResetNeeded`` before the first episode."""
@@ -238,7 +238,7 @@ class EpisodeVectorEnv(gym.vector.VectorEnv[Any, np.ndarray, np.ndarray]):
                  max_episode_steps: int | None, *, threads: int = 1,
                  core_episodes: int = MAX_CORE_EPISODES) -> None:
         self.num_envs = _check.integer("num_envs", num_envs, low=1)
-        self.pool = Pool(episodes)
+        self.pool = EpisodeSampler(episodes)
         """training episodes of unseeded resets"""
         self._threads = _check.integer("threads", threads, low=1)
         size = min(core_episodes, -(-num_envs // threads))
@@ -290,16 +290,16 @@ class EpisodeVectorEnv(gym.vector.VectorEnv[Any, np.ndarray, np.ndarray]):
                              "together")
         seeds = self._seeds(seed)
         if any(one is not None for one in seeds):
-            self.pool.restart()
+            self.pool.reset()
         chosen = []
         for k, one in enumerate(seeds):
             random = self._randoms[k]
             if one is not None or random is None:
                 self._randoms[k] = random = seeding.np_random(one)[0]
-            chosen.append(self.pool.draw(random) if one is None else one)
-        warn_of_reserved(chosen)
+            chosen.append(self.pool.sample_seed(random) if one is None else one)
+        warn_test_seeds(chosen)
         for number in chosen:
-            self.pool.provide(self.world, number)
+            self.pool.ensure_simulated(self.world, number)
         for core, part in zip(self.cores, self._parts, strict=True):
             core.begin(chosen[part])
         self._step = 1

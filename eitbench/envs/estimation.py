@@ -9,17 +9,17 @@ import numpy as np
 from gymnasium import spaces
 
 from eitbench import _check
-from eitbench.data.recordings import (
+from eitbench.data.episode_cache import (
     cycle_voltages,
     integrals,
-    outline,
     score_mass,
+    scoring_constants,
     step_error,
     velocity_error,
 )
 from eitbench.envs.episodes import EpisodeCore, EpisodeEnv, EpisodeVectorEnv, Observation
-from eitbench.worlds.registry import entry
-from eitbench.worlds.streams import randomness
+from eitbench.worlds.random_streams import episode_streams
+from eitbench.worlds.registry import Entry, entry
 from eitbench.worlds.task import lag_steps, make_task
 from eitbench.worlds.world import Discretisation, World
 
@@ -52,7 +52,7 @@ class EstimationCore(EpisodeCore):
         self.currents = np.zeros((self.length + 1, cycle.shape[1]))
         """(T + lag + 1, L) A (A/m in 2D) of every step and after the last: the cycle, then 0"""
         self.currents[:world.n_steps] = cycle[np.arange(world.n_steps) % len(cycle)]
-        stage = outline(world)
+        stage = scoring_constants(world)
         self.n_nodes: int = stage.mass.shape[0]
         voltage = 100.0 * stage.largest_voltage
         current = np.abs(cycle).max()
@@ -62,7 +62,7 @@ class EstimationCore(EpisodeCore):
         limit = np.full(self.n_nodes, 10.0 * world.expected_concentration)
         velocity = world.velocity_model
         if velocity is not None:
-            limit = np.append(limit, np.full(velocity.size, 10.0 * max(velocity.nominal)))
+            limit = np.append(limit, np.full(velocity.n_parameters, 10.0 * max(velocity.nominal)))
         self.action_space = spaces.Box(-limit, limit, dtype=np.float64)
 
     def begin(self, seeds: Sequence[int],
@@ -147,6 +147,7 @@ class EstimationEnv(EpisodeEnv):
     |---|---|---|
     | `lag` | that of the id | integer from 0 to T − 1, or "all" (= T − 1): the whole record first |
     | `assume` | that of the id | dict of wrong assumptions on the flow in the task's model |
+    | `variant` | None | name of a robustness variant, as "strong-slugs" of `eitbench/Pipe2D-v0` |
     | `world` | None | numbers to change, as in `{"instrument": {"noise_relative": 0.02}}` |
     | `episodes` | None | training episodes of unseeded resets; None: 1, 8, … up to 1000 |
     | `render_mode` | None | "rgb_array": truth, estimate, standard deviation, active pair |
@@ -154,10 +155,11 @@ class EstimationEnv(EpisodeEnv):
 
     core: EstimationCore
 
-    def __init__(self, name: str, *, world: dict[str, Any] | None = None,
-                 lag: int | str | None = None, assume: dict[str, Any] | None = None,
-                 episodes: int | None = None, render_mode: str | None = None) -> None:
-        played, self.lag, assumed = read_arguments(name, world, lag, assume)
+    def __init__(self, name: str, *, variant: str | None = None,
+                 world: dict[str, Any] | None = None, lag: int | str | None = None,
+                 assume: dict[str, Any] | None = None, episodes: int | None = None,
+                 render_mode: str | None = None) -> None:
+        played, self.lag, assumed = read_arguments(entry(name, variant), world, lag, assume)
         super().__init__(EstimationCore(played, self.lag), episodes, render_mode)
         self._task_options = {"lag": self.lag, **assumed}
         self.n_nodes = self.core.n_nodes
@@ -202,7 +204,7 @@ class EstimationEnv(EpisodeEnv):
         correct = make_task(self.world, self.lag)
         transport = self.world.true_transport(
             Discretisation(correct.transport, correct.observation),
-            randomness(self.core.seeds[0]).flow)
+            episode_streams(self.core.seeds[0]).flow)
         return Revealed(self.core.voltages[:n_steps, 0].copy(),
                         self.core.currents[:n_steps].copy(), transport, velocity)
 
@@ -215,10 +217,11 @@ class EstimationEnv(EpisodeEnv):
 class EstimationVectorEnv(EpisodeVectorEnv):
     """`EstimationEnv`, many times; see there and `EpisodeVectorEnv`."""
 
-    def __init__(self, name: str, *, num_envs: int = 1, world: dict[str, Any] | None = None,
-                 lag: int | str | None = None, assume: dict[str, Any] | None = None,
-                 episodes: int | None = None, max_episode_steps: int | None = None) -> None:
-        played, lag, _ = read_arguments(name, world, lag, assume)
+    def __init__(self, name: str, *, num_envs: int = 1, variant: str | None = None,
+                 world: dict[str, Any] | None = None, lag: int | str | None = None,
+                 assume: dict[str, Any] | None = None, episodes: int | None = None,
+                 max_episode_steps: int | None = None) -> None:
+        played, lag, _ = read_arguments(entry(name, variant), world, lag, assume)
         super().__init__(lambda: EstimationCore(played, lag), num_envs, episodes,
                          max_episode_steps)
 
@@ -226,12 +229,11 @@ class EstimationVectorEnv(EpisodeVectorEnv):
         return checked_actions(actions, self.action_space, self.cores[0].n_nodes)
 
 
-def read_arguments(name: str, changes: dict[str, Any] | None, lag: int | str | None,
+def read_arguments(registered: Entry, changes: dict[str, Any] | None, lag: int | str | None,
                    assumed: dict[str, Any] | None) -> tuple[World, int, dict[str, Any]]:
     """Return the world, the lag and the assumptions on the flow of an id with these arguments;
     ``ValueError`` names an argument that is not allowed."""
-    registered = entry(name)
-    world = registered.world.changed(changes)
+    world = registered.world.with_changes(changes)
     if lag is None:
         lag = registered.settings.get("lag", 0)
     if assumed is None:

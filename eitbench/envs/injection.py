@@ -11,7 +11,7 @@ from eitbench import _check
 from eitbench.envs.episodes import MAX_CORE_EPISODES, EpisodeEnv, EpisodeVectorEnv
 from eitbench.envs.injection_core import InjectionCore
 from eitbench.estimation.onboard.rules import Rules
-from eitbench.worlds.registry import entry
+from eitbench.worlds.registry import Entry, entry
 
 
 class InjectionEnv(EpisodeEnv):
@@ -21,7 +21,8 @@ class InjectionEnv(EpisodeEnv):
 
     `Discrete(n)`: the number of an electrode pair (0, 1), (0, 2), … (`Rules.pairs`); the
     current enters at the first electrode and leaves at the second. With a budget, the last action
-    is no injection. With `instrument.limit`, `Box`: a current for each electrode relative to the
+    is no injection. With `instrument.current_norm`, `Box`: a current for each electrode,
+    relative to the
     instrument's current, see `Rules`.
 
     ## Observation Space
@@ -57,6 +58,7 @@ class InjectionEnv(EpisodeEnv):
     | `observation` | "scaled" | or "raw" |
     | `gate` | that of the id | the filter rejects readings beyond this many standard deviations |
     | `inflow` | that of the id | inflow prior: "white" noise (Table 5.1), or "learned" |
+    | `variant` | None | name of a robustness variant of the id |
     | `world` | None | numbers to change, as in `{"schedule": {"budget": 20}}` |
     | `episodes` | None | training episodes of unseeded resets; None: 1, 8, … up to 1000 |
     | `render_mode` | None | "rgb_array": truth, estimate, standard deviation, injection |
@@ -65,11 +67,11 @@ class InjectionEnv(EpisodeEnv):
 
     core: InjectionCore
 
-    def __init__(self, name: str, *, world: dict[str, Any] | None = None,
-                 estimator: str = "reduced", observation: str = "scaled",
-                 gate: float | None = None, inflow: str | None = None,
+    def __init__(self, name: str, *, variant: str | None = None,
+                 world: dict[str, Any] | None = None, estimator: str = "reduced",
+                 observation: str = "scaled", gate: float | None = None, inflow: str | None = None,
                  episodes: int | None = None, render_mode: str | None = None) -> None:
-        self.rules = read_rules(name, world, gate, inflow, estimator)
+        self.rules = read_rules(entry(name, variant), world, gate, inflow, estimator)
         super().__init__(InjectionCore(self.rules, estimator, observation), episodes, render_mode)
 
     def _checked(self, action: Any) -> np.ndarray:
@@ -107,11 +109,12 @@ class InjectionVectorEnv(EpisodeVectorEnv):
         it.
     """
 
-    def __init__(self, name: str, *, num_envs: int = 1, world: dict[str, Any] | None = None,
-                 estimator: str = "reduced", observation: str = "scaled", gate: float | None = None,
-                 inflow: str | None = None, episodes: int | None = None, threads: int = 1,
+    def __init__(self, name: str, *, num_envs: int = 1, variant: str | None = None,
+                 world: dict[str, Any] | None = None, estimator: str = "reduced",
+                 observation: str = "scaled", gate: float | None = None, inflow: str | None = None,
+                 episodes: int | None = None, threads: int = 1,
                  max_episode_steps: int | None = None) -> None:
-        self.rules = rules = read_rules(name, world, gate, inflow, estimator)
+        self.rules = rules = read_rules(entry(name, variant), world, gate, inflow, estimator)
         super().__init__(lambda: InjectionCore(rules, estimator, observation), num_envs, episodes,
                          max_episode_steps, threads=threads,
                          core_episodes=num_envs if estimator == "none" else MAX_CORE_EPISODES)
@@ -138,13 +141,12 @@ class InjectionVectorEnv(EpisodeVectorEnv):
         return chosen
 
 
-def read_rules(name: str, changes: dict[str, Any] | None, gate: float | None, inflow: str | None,
-               estimator: str) -> Rules:
+def read_rules(registered: Entry, changes: dict[str, Any] | None, gate: float | None,
+               inflow: str | None, estimator: str) -> Rules:
     """Return the rules of an id with these arguments; ``ValueError`` names an argument that is not
     allowed."""
-    registered = entry(name)
     if gate is None:
         gate = registered.settings.get("gate", np.inf)
     if inflow is None:
         inflow = registered.settings.get("inflow", "white")
-    return Rules(registered.world.changed(changes), gate, estimator != "none", inflow)
+    return Rules(registered.world.with_changes(changes), gate, estimator != "none", inflow)

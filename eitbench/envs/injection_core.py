@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from gymnasium import spaces
 
-from eitbench.data.recordings import faults_of, integrals, outline, score_mass
+from eitbench.data.episode_cache import instrument_faults, integrals, score_mass, scoring_constants
 from eitbench.envs.episodes import EpisodeCore, Observation
 from eitbench.estimation.onboard.innovation import Innovation
 from eitbench.estimation.onboard.onboard_filter import OnboardFilter, filters_type
@@ -36,7 +36,7 @@ def scaled(rules: Rules, observation: Observation) -> np.ndarray:
     world = rules.world
     level = world.expected_concentration
     left = np.array([world.n_steps, rules.budget or 1][:observation["left"].shape[-1]])
-    parts = [observation["voltages"] / outline(world).largest_voltage,
+    parts = [observation["voltages"] / scoring_constants(world).largest_voltage,
              observation["recent"] / rules.amplitude,
              observation["innovations"] / 3.0, 2.0 * (observation["mean"] / level - 1.0),
              observation["std"] / (world.prior.inflow_std * level), observation["doubt"],
@@ -91,11 +91,11 @@ class InjectionCore(EpisodeCore):
         world = self.world
         rules = self.rules
         L = world.currents.shape[1]
-        largest = 1e3 * outline(world).largest_voltage
+        largest = 1e3 * scoring_constants(world).largest_voltage
         current = 1.5 * rules.amplitude                                    # "L2" goes up to √2
         shown = {"voltages": _box(largest, L), "currents": _box(current, L)}
         if self._filters_type:
-            columns, rows = world.vessel.patches
+            columns, rows = world.vessel.coarse_grid_shape
             mean = 1e3 * world.expected_concentration
             shown |= {"recent": _box(current, RECENT, L), "frame": _box(largest, self.first, L),
                       "innovations": _box(1e6, L), "mean": _box(mean, columns * rows),
@@ -103,8 +103,8 @@ class InjectionCore(EpisodeCore):
             flow = world.velocity_model
             if flow is not None:
                 fastest = 100.0 * max(flow.nominal)
-                shown |= {"velocity": _box(fastest, flow.size),
-                          "velocity_std": _box(fastest, flow.size, low=0.0)}
+                shown |= {"velocity": _box(fastest, flow.n_parameters),
+                          "velocity_std": _box(fastest, flow.n_parameters, low=0.0)}
         left = [world.n_steps] if rules.budget is None else [world.n_steps, rules.budget]
         shown["left"] = spaces.Box(np.zeros(len(left)), np.array(left, dtype=float),
                                    dtype=np.float64)
@@ -128,7 +128,7 @@ class InjectionCore(EpisodeCore):
         """V and A (A/m in 2D), (B, L) each, of the last injections"""
         self._recent = np.zeros((B, RECENT, L))
         self._homogeneous: np.ndarray | None = None
-        faults = [faults_of(world, seed) for seed in seeds]
+        faults = [instrument_faults(world, seed) for seed in seeds]
         self.faults = Faults(*(np.array(part) for part in zip(*faults, strict=True)))
         """faults of the instrument in these episodes, (B, L) each"""
         super().begin(seeds, provide)
@@ -213,7 +213,7 @@ class InjectionCore(EpisodeCore):
         """Present means and standard deviations (B, n) in mol/m³; without an estimator the expected
         concentration and zero."""
         if not self._filters_type:
-            shape = (len(self.spent), outline(self.world).mass.shape[0])
+            shape = (len(self.spent), scoring_constants(self.world).mass.shape[0])
             return np.full(shape, self.world.expected_concentration), np.zeros(shape)
         return self._filters.means(), self._filters.spreads()
 

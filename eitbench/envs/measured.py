@@ -25,7 +25,7 @@ from eitbench.measured.model import (
 )
 from eitbench.measured.task import task_from_measurements
 from eitbench.measured.vessel import INITIAL_CONTACT_IMPEDANCE, VesselConfig, read_vessel
-from eitbench.physics.rest import AtRest
+from eitbench.physics.stationary import StationaryTransport
 from eitbench.worlds.task import Task
 
 NOISE_FRAMES = 1000
@@ -195,7 +195,7 @@ class MeasuredEnv(FixedLengthEnv):
 
     def scoring_steps(self, t: int) -> range:
         """Return the injections, 1 … T, whose withheld readings score an estimate at t."""
-        if isinstance(self.task.transport, AtRest):
+        if isinstance(self.task.transport, StationaryTransport):
             return range(1, self.episode_steps + 1) if t == self.episode_steps else range(0)
         return range(t, t + 1) if t > self.task.warm_up else range(0)
 

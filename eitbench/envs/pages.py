@@ -40,7 +40,7 @@ def page(id: str) -> str:
     sections = inspect.cleandoc(type(env).__doc__ or "").split("\n\n", 1)[1]
     observation = sections.index("## Rewards")
     shown = env.core.space() if registered.track == "injection" else env.observation_space
-    parts = ["## Description", registered.about.strip(), _overview(env),
+    parts = ["## Description", registered.description.strip(), _overview(env),
              sections[:observation].strip(), _observation_table(shown, env.world),
              sections[observation:].strip(), "## World", _world_table(registered.world)]
     return "\n\n".join(parts) + "\n"
@@ -54,7 +54,7 @@ def _overview(env: Any) -> str:
             "steps of an episode": env.episode_steps,
             "scored states": f"{world.schedule.scored_steps}: t = {world.warm_up + 1} … "
                              f"{world.n_steps}",
-            "time steps before t = 0": world.lead_in}
+            "time steps before t = 0": world.spin_up_steps}
     if hasattr(env, "lag"):
         rows["lag"] = env.lag
     else:
@@ -76,7 +76,7 @@ def _short(space: gym.Space) -> str:
 
 
 def _observation_table(space: spaces.Dict, world: World) -> str:
-    columns, rows = world.vessel.patches
+    columns, rows = world.vessel.coarse_grid_shape
     lines = [f"| `{name}` | {inner.shape} | {MEANINGS[name].format(columns=columns, rows=rows)} |"
              for name, inner in space.items()]
     return "\n".join(["| key | shape | meaning |", "|---|---|---|", *lines])

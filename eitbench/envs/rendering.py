@@ -149,7 +149,7 @@ def draw_comparison(task: Task, fields: list[tuple[str, Mesh, np.ndarray]], curr
 
 
 def _is_tank(task: Task) -> bool:
-    return task.vessel is not None and not task.vessel.is_long
+    return task.vessel is not None and not task.vessel.is_elongated
 
 
 def _figure(size: tuple[float, float]) -> Figure:

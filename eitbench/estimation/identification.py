@@ -10,7 +10,7 @@ import numpy as np
 
 from eitbench import _check
 from eitbench.data.dataset import Dataset, Example
-from eitbench.data.seeds import SPLITS, name_seed
+from eitbench.data.seeds import SPLITS, format_seed
 from eitbench.estimation.estimators import CalibrationFrame
 from eitbench.estimation.forward import LinearisedForwardModel
 from eitbench.estimation.identified import IdentifiedModel, task_fingerprint
@@ -87,7 +87,7 @@ def identify_model(examples: Dataset, *, modes: int = 64, residual_only: bool = 
     """
     if others := [seed for seed in examples.seeds if seed not in SPLITS["train"]]:
         raise ValueError("examples' seeds must be of the split train, from which alone is learned; "
-                         f"got {name_seed(others[0])}")
+                         f"got {format_seed(others[0])}")
     world = examples.world
     q = _check.integer("modes", modes, low=1, high=examples.mesh.n_nodes)
     if len(examples) * world.n_steps <= q:

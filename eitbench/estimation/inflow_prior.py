@@ -15,7 +15,7 @@ import numpy as np
 from eitbench import _check
 from eitbench._files import write_atomically
 from eitbench._notice import say
-from eitbench.data.seeds import SPLITS, name_seed
+from eitbench.data.seeds import SPLITS, format_seed
 from eitbench.worlds.registry import entries
 
 if TYPE_CHECKING:
@@ -223,9 +223,9 @@ def fit_prior_from_episodes(world: World, seeds: Sequence[int], **how: Any) -> I
     """
     if others := [seed for seed in seeds if seed not in SPLITS["train"]]:
         raise ValueError("seeds must be of the split train, from which alone is learned; got "
-                         f"{name_seed(others[0])}")
+                         f"{format_seed(others[0])}")
     inflows = np.array([world.sample_inflow(seed) for seed in seeds])
-    mesh, inlet = world.vessel.carrier(fine=False)
+    mesh, inlet = world.vessel.transport_mesh(fine=False)
     return fit_inflow_prior(inflows / world.background, mesh.points[np.unique(inlet)],
                             world.time_step, **how)
 
@@ -255,7 +255,8 @@ def _say_other_world(world: str, learned: str) -> None:
 
 def nominal_worlds(name: str) -> set[str]:
     """Return the name of a world and of the world that its estimators are told of."""
-    homes = {each.home for each in entries().values() if each.home and each.world.name == name}
+    homes = {each.nominal for each in entries().values()
+             if each.nominal and each.world.name == name}
     return {name} | {entries()[home].world.name for home in homes}
 
 

@@ -20,7 +20,7 @@ from eitbench.estimation.filter import Filter, StateSpace
 from eitbench.estimation.forward import Forward
 from eitbench.estimation.smoothness import smoothness_covariance
 from eitbench.estimation.walk import RandomWalk
-from eitbench.physics.rest import AtRest
+from eitbench.physics.stationary import StationaryTransport
 
 if TYPE_CHECKING:
     from eitbench.numerics.mesh import Mesh
@@ -154,12 +154,12 @@ def nodal_states(transport: Transport, prior: Prior, c_ref: float) -> NodalState
     c_ref : float
         Best homogeneous estimate ĉ_bh in mol/m³.
     """
-    if len(transport.inlet) and not isinstance(transport, AtRest):
+    if len(transport.inlet) and not isinstance(transport, StationaryTransport):
         return _flowing_states(transport, prior, c_ref)
     mean = np.full(transport.mesh.n_nodes, c_ref)
     if isinstance(transport, RandomWalk):
         motion = Motion(transport.step, noise=(c_ref * prior.nodal_std)**2 * transport.covariance)
-    elif isinstance(transport, AtRest):
+    elif isinstance(transport, StationaryTransport):
         walk = (c_ref * prior.nodal_std)**2
         motion = Motion(noise=walk * np.eye(len(mean)) if walk else None)
     else:

@@ -18,7 +18,7 @@ CACHE_BYTES = 2**27
 class TransferResistanceModel(Protocol):
     """What the quadratic is of; such as `ObservationModel`."""
 
-    smallest_concentration: float
+    min_concentration: float
     """mol/m³, as which what is below counts"""
 
     def resistance_derivatives(self, concentration: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -43,7 +43,7 @@ class QuadraticVoltageModel:
 
     def __init__(self, model: TransferResistanceModel, c_ref: float, modes: np.ndarray) -> None:
         self.c_ref = _check.number("c_ref", c_ref, low=0.0, open_low=True, units="mol/m³")
-        self.smallest = model.smallest_concentration
+        self.smallest = model.min_concentration
         modes = _check.array("modes", modes, (None, None))
         n, q = modes.shape
         self._to_modes = np.linalg.pinv(modes)
@@ -121,7 +121,7 @@ class ScaledVoltageModel:
 
     def __init__(self, model: TransferResistanceModel, c_ref: float, modes: np.ndarray) -> None:
         self.c_ref = _check.number("c_ref", c_ref, low=0.0, open_low=True, units="mol/m³")
-        self.smallest = model.smallest_concentration
+        self.smallest = model.min_concentration
         modes = _check.array("modes", modes, (None, None))
         with_level, _ = np.linalg.qr(np.column_stack([np.ones(len(modes)), modes]))
         self.quadratic = QuadraticVoltageModel(_Scaled(model, c_ref), c_ref, with_level)
@@ -146,7 +146,7 @@ class _Scaled:
     def __init__(self, model: TransferResistanceModel, c_ref: float) -> None:
         self.model = model
         self.c_ref = c_ref
-        self.smallest_concentration = model.smallest_concentration
+        self.min_concentration = model.min_concentration
 
     def resistance_derivatives(self, concentration: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         R, by_c = self.model.resistance_derivatives(concentration)

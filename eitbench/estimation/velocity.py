@@ -161,7 +161,7 @@ def task_velocity_prior(task: Task, bounds: tuple[float, float] = (0.05, 4.0)) -
     flow = task.velocity
     if flow is None:
         raise ValueError("task must ask for the flow, got one that does not")
-    return VelocityPrior(task.transport_at, flow.directions, np.array(flow.nominal),
+    return VelocityPrior(task.transport_at, flow.basis_fields, np.array(flow.nominal),
                        np.array(flow.initial_std), np.array(flow.walk_std), flow.profiles, bounds)
 
 

@@ -18,7 +18,7 @@ CONTACT_PRIOR_LOG_STD = 2.0
 """Prior standard deviation of the mean of ln z σ."""
 CONTACT_BETWEEN_LOG_STD = 0.5
 """Prior standard deviation of ln z_l relative to the mean of all electrodes."""
-FIT_NOISE = VoltageNoise(relative=0.01, of_largest=0.001)
+FIT_NOISE = VoltageNoise(relative=0.01, relative_to_max=0.001)
 """Noise that weights the measurements in the first fit."""
 MIN_NOISE_FRAMES = 8
 

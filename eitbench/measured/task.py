@@ -20,8 +20,8 @@ from eitbench.measured.measurements import Measurements
 from eitbench.measured.model import MeasurementModel, complete_channels, visible_measurement
 from eitbench.measured.vessel import VesselConfig
 from eitbench.physics.observation import LinearConductivity, ObservationModel
-from eitbench.physics.profiles import parabola
-from eitbench.physics.rest import AtRest
+from eitbench.physics.profiles import parabolic_model
+from eitbench.physics.stationary import StationaryTransport
 from eitbench.physics.transport import ConvectionDiffusion
 from eitbench.worlds.task import Task
 from eitbench.worlds.vessels import PlanePipe, RoundPipe
@@ -89,7 +89,7 @@ def task_from_measurements(vessel: VesselConfig, calibration: Calibration,
     noise = calibration.noise
     if calibration.noise_from_repeats and moves:
         noise = replace(noise, relative=float(np.hypot(noise.relative, model_error)))
-    task = Task(AtRest(mesh, step), observation, noise, measurements.currents, T,
+    task = Task(StationaryTransport(mesh, step), observation, noise, measurements.currents, T,
                 min(frame, T - 1), 0, background, min(frame, T), Prior(background))
     if moves and vessel.flow is not None:
         return _with_flow(task, vessel)
@@ -113,14 +113,15 @@ def _with_flow(task: Task, vessel: VesselConfig) -> Task:
     """Replace the transport by convection–diffusion, and add the velocity if it is estimated."""
     shape, flow = vessel.shape, vessel.flow
     assert isinstance(shape, PlanePipe | RoundPipe) and flow is not None
-    _, inlet = shape.carrier(fine=False)
+    _, inlet = shape.transport_mesh(fine=False)
     task = replace(task, transport=ConvectionDiffusion(
-        task.mesh, shape.laminar(flow.mean_velocity), flow.diffusivity, task.transport.time_step,
+        task.mesh, shape.laminar_velocity(flow.mean_velocity), flow.diffusivity,
+        task.transport.time_step,
         substeps=shape.substeps(fine=False), inlet=inlet))
     if not flow.is_estimated:
         return task
     assert isinstance(shape, PlanePipe)
-    return replace(task, velocity=parabola(shape.half_width, flow.mean_velocity,
+    return replace(task, velocity=parabolic_model(shape.half_width, flow.mean_velocity,
                                            flow.velocity_std, flow.velocity_walk))
 
 
@@ -151,7 +152,8 @@ def maximise_evidence(task: Task, measurements: Measurements, free: list[str],
     factor, noise = best["noise"], task.noise
     return replace(
         task, noise=replace(noise, relative=factor * noise.relative,
-                            of_largest=factor * noise.of_largest, floor=factor * noise.floor),
+                            relative_to_max=factor * noise.relative_to_max,
+                            floor=factor * noise.floor),
         prior=replace(task.prior, initial_std=best["initial"],
                       nodal_std=min(best["walk"], best["initial"])))
 

@@ -94,7 +94,7 @@ class VesselConfig:
 
     def transport_mesh(self) -> Mesh:
         """Return the mesh of the estimates."""
-        return self._rotate_mesh(self.shape.carrier(fine=False)[0])
+        return self._rotate_mesh(self.shape.transport_mesh(fine=False)[0])
 
     def electrode_model(self, contact_impedance: np.ndarray | float) -> CompleteElectrodeModel:
         """Return the electrodes with these contact impedances, (L,) or a scalar, in Ω·m²."""
@@ -103,7 +103,7 @@ class VesselConfig:
     @cached_property
     def _electrodes(self) -> CompleteElectrodeModel:
         # finer than estimates need, as calibration corrects its error for homogeneous fluid only
-        model = self.shape.electrode_model(fine=self.shape.carrier(fine=False)[0].dim == 2)
+        model = self.shape.electrode_model(fine=self.shape.transport_mesh(fine=False)[0].dim == 2)
         mesh = self._rotate_mesh(model.mesh)
         return model if mesh is model.mesh else CompleteElectrodeModel(
             mesh, model.electrodes, model.contact_impedance, model.order)
@@ -166,7 +166,7 @@ def _shape(kind: str, entries: dict[str, Any], folder: Path) -> Any:
     if kind == "circle":
         tank = RoundTank(radius=entries["radius"], n_electrodes=count)
         wall = 2.0 * np.pi * tank.radius
-        return replace(tank, electrode_cover=_cover(entries, "width", count / wall))
+        return replace(tank, electrode_coverage=_cover(entries, "width", count / wall))
     if kind == "rectangle":
         if count % 2:
             raise ValueError(f"vessel.electrodes must be even, half on each wall, got {count}")
@@ -174,11 +174,11 @@ def _shape(kind: str, entries: dict[str, Any], folder: Path) -> Any:
         pipe = PlanePipe(length=entries["length"], half_width=0.5 * width,
                          electrodes_per_wall=count // 2)
         cover = _cover(entries, "electrode_width", count // 2 / pipe.length)
-        return replace(pipe, electrode_cover=cover)
+        return replace(pipe, electrode_coverage=cover)
     if kind == "cylinder":
         return RoundPipe(length=entries["length"], radius=entries["radius"],
                          electrode_rings=entries["rings"], electrodes_per_ring=count,
-                         electrode_length=entries["height"], electrode_cover=entries["cover"])
+                         electrode_length=entries["height"], electrode_coverage=entries["cover"])
     path = folder / str(entries["file"])
     if not path.is_file():
         raise ValueError(f"vessel.file must be a mesh file, got {path}")

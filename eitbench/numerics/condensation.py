@@ -14,7 +14,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from eitbench.numerics.compiled import compiled_kernels, scratch
-from eitbench.numerics.sparse_lu import eliminated
+from eitbench.numerics.sparse_lu import factorise_no_pivot
 
 _LEAF = 200
 """Unknowns of a part of the body that is not cut any more."""
@@ -123,7 +123,7 @@ class Condensation:
 
 def _filled(pattern: sp.csc_array) -> sp.csc_array:
     """The Cholesky factor's pattern, as SuperLU finds it for a matrix on which nothing cancels."""
-    factors = eliminated(_diagonally_dominant(pattern), "NATURAL")
+    factors = factorise_no_pivot(_diagonally_dominant(pattern), "NATURAL")
     back = np.argsort(factors.perm_c)      # SuperLU may have postordered the elimination tree
     lower = factors.L.tocoo()
     i, j = back[lower.row], back[lower.col]
@@ -233,7 +233,8 @@ def _nested_dissection(pattern: sp.csc_array, places: np.ndarray) -> np.ndarray:
 
 def _minimum_degree(pattern: sp.csc_array) -> np.ndarray:
     """Position of each unknown in a fill-reducing order."""
-    return eliminated(_diagonally_dominant(pattern), "MMD_AT_PLUS_A").perm_c.astype(np.int64)
+    factors = factorise_no_pivot(_diagonally_dominant(pattern), "MMD_AT_PLUS_A")
+    return factors.perm_c.astype(np.int64)
 
 
 def _permuted(pattern: sp.csc_array, place: np.ndarray) -> sp.csc_array:

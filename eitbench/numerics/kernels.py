@@ -373,7 +373,7 @@ def subtract_gradient_products(cells, unknowns, gradient, fields, table, G):
 
 
 @njit(cache=True)
-def solve_lu(row_place, column_place, lower_pointer, lower_index, lower, upper_pointer,
+def solve_lu(row_perm, column_perm, lower_pointer, lower_index, lower, upper_pointer,
              upper_index, upper, scale, right, work, solution):
     """Solve A x = b for eight right-hand sides (n, 8).
 
@@ -381,7 +381,7 @@ def solve_lu(row_place, column_place, lower_pointer, lower_index, lower, upper_p
     """
     n = len(scale)
     for i in range(n):
-        store(work, row_place[i] * WIDTH, load(right, i * WIDTH))
+        store(work, row_perm[i] * WIDTH, load(right, i * WIDTH))
     for i in range(n):
         total = load(work, i * WIDTH)
         for e in range(lower_pointer[i], lower_pointer[i + 1]):
@@ -393,18 +393,18 @@ def solve_lu(row_place, column_place, lower_pointer, lower_index, lower, upper_p
             total = subtract_product(total, splat(upper[e]), load(work, upper_index[e] * WIDTH))
         store(work, i * WIDTH, times(total, splat(scale[i])))
     for i in range(n):
-        store(solution, i * WIDTH, load(work, column_place[i] * WIDTH))
+        store(solution, i * WIDTH, load(work, column_perm[i] * WIDTH))
 
 
 @njit(cache=True)
-def advance_wide(mass, explicit, implicit_inlet, lower, upper, scale, row_place, unknown, inlet,
-                 substeps, rate, state, before, slope, inflow, source, sourced, work):
+def advance_wide(mass, explicit, implicit_inlet, lower, upper, scale, row_perm, unknown, inlet,
+                 substeps, rate, state, before, slope, inflow, source, has_source, work):
     """All sub-steps of `ConvectionDiffusion` for ``state`` (n, WIDE), in place.
 
     Matrices are (pointers, indices, values) by rows: L and U in the order of elimination, in which
-    row r of the others stands at row_place[r], and node unknown[i] is the i-th unknown. Blocks
+    row r of the others stands at row_perm[r], and node unknown[i] is the i-th unknown. Blocks
     (…, WIDE) are flattened: the inflow at first and what it changes by in a sub-step, room for the
-    present one, f if there is one (``sourced``), and room to work.
+    present one, f if there is one (``has_source``), and room to work.
     """
     for k in range(substeps + 1):
         time = float(k) if k else 0.5
@@ -413,22 +413,22 @@ def advance_wide(mass, explicit, implicit_inlet, lower, upper, scale, row_place,
             store(inflow, j, plus(load_wide(before, j), change))
         halved = k < 2
         _right_side(mass if halved else explicit, rate if halved else 1.0, implicit_inlet,
-                    (0.5 if halved else 1.0) * sourced, row_place, state, inflow, source, work)
+                    (0.5 if halved else 1.0) * has_source, row_perm, state, inflow, source, work)
         _substitute(lower, upper, scale, unknown, work, state)
         for j in range(len(inlet)):
             store(state, inlet[j] * WIDE, load_wide(inflow, j * WIDE))
 
 
 @njit
-def _right_side(matrix, rate, implicit_inlet, weight, row_place, state, inflow, source, work):
+def _right_side(matrix, rate, implicit_inlet, weight, row_perm, state, inflow, source, work):
     """rate·(matrix c) − I c_in + weight·f, in the order of elimination."""
-    for r in range(len(row_place)):
+    for r in range(len(row_perm)):
         total = times(splat_wide(rate), _row_product(matrix, r, state))
         given = _row_product(implicit_inlet, r, inflow)
         total = plus(total, times(splat_wide(-1.0), given))
         if weight:
             total = plus(total, times(splat_wide(weight), load_wide(source, r * WIDE)))
-        store(work, row_place[r] * WIDE, total)
+        store(work, row_perm[r] * WIDE, total)
 
 
 @njit

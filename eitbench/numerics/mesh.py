@@ -198,7 +198,7 @@ def _tree(corner: np.ndarray) -> tuple[cKDTree, float]:
     return cKDTree(middle), float(np.linalg.norm(corner - middle[:, None], axis=2).max())
 
 
-def checked_facets(name: str, facets: np.ndarray, mesh: Mesh) -> np.ndarray:
+def validate_facets(name: str, facets: np.ndarray, mesh: Mesh) -> np.ndarray:
     """``facets`` as an array of node numbers (k ≥ 1, d); else a ``ValueError`` with their name."""
     facets = np.asarray(facets)
     if (facets.ndim != 2 or facets.shape[1] != mesh.dim or len(facets) == 0
@@ -208,12 +208,12 @@ def checked_facets(name: str, facets: np.ndarray, mesh: Mesh) -> np.ndarray:
     return facets
 
 
-def as_set(facets: np.ndarray) -> set[tuple[int, ...]]:
+def facet_set(facets: np.ndarray) -> set[tuple[int, ...]]:
     """Facets as tuples of node numbers."""
     return set(map(tuple, facets.tolist()))
 
 
-def increasing(name: str, line: Sequence[float] | np.ndarray) -> np.ndarray:
+def check_increasing(name: str, line: Sequence[float] | np.ndarray) -> np.ndarray:
     """(k ≥ 2,) coordinates in m that increase; else a ``ValueError`` with their name."""
     line = _check.array(name, line, (None,), units="m")
     if len(line) < 2 or (np.diff(line) <= 0).any():
@@ -229,8 +229,8 @@ def rectangle_mesh(x: Sequence[float] | np.ndarray, y: Sequence[float] | np.ndar
     that matrices on this mesh are banded with half-bandwidth ``len(y) + 1``. Diagonals alternate,
     which keeps the mesh symmetric.
     """
-    x = increasing("x", x)
-    y = increasing("y", y)
+    x = check_increasing("x", x)
+    y = check_increasing("y", y)
     ny = len(y)
     points = np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1).reshape(-1, 2)
     corners = np.meshgrid(np.arange(len(x) - 1), np.arange(ny - 1), indexing="ij")

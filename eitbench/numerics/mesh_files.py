@@ -22,14 +22,14 @@ import numpy as np
 
 from eitbench import _check
 from eitbench._extras import explained
-from eitbench.numerics.mesh import Mesh, as_set
+from eitbench.numerics.mesh import Mesh, facet_set
 
 _CELL = {2: "triangle", 3: "tetra"}
 _FACET = {2: "line", 3: "triangle"}
 """meshio's cell types by the number of space dimensions."""
 
 
-class MeshFile(NamedTuple):
+class MeshData(NamedTuple):
     """Content of a mesh file."""
 
     mesh: Mesh
@@ -38,7 +38,7 @@ class MeshFile(NamedTuple):
 
 
 def read_mesh(path: str | PathLike[str], sha256: str | None = None, *,
-              scale: float = 1.0) -> MeshFile:
+              scale: float = 1.0) -> MeshData:
     """Read a mesh of triangles (in the plane z = 0) or tetrahedra, and its named boundary facets.
 
     Nodes keep the file's order; nodes of no cell are dropped. Groups of other dimensions, such as
@@ -79,14 +79,14 @@ def read_mesh(path: str | PathLike[str], sha256: str | None = None, *,
         raise ValueError(f"{path}: {error}") from None
     new_number = np.full(len(content.points), -1)
     new_number[used] = np.arange(len(used))
-    boundary = as_set(mesh.boundary_facets)
+    boundary = facet_set(mesh.boundary_facets)
     groups = {}
     for name, facets in _facet_groups(path, content, dim).items():
         groups[name] = np.unique(np.sort(new_number[facets], axis=1), axis=0)
-        if outside := as_set(groups[name]) - boundary:
+        if outside := facet_set(groups[name]) - boundary:
             raise ValueError(f"{path}: group {name!r} must lie on the boundary, got "
                              f"{len(outside)} of {len(facets)} facets that do not")
-    return MeshFile(mesh, groups)
+    return MeshData(mesh, groups)
 
 
 def _check_file(path: Path, sha256: str | None) -> None:

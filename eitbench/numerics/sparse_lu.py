@@ -10,20 +10,20 @@ from scipy.sparse.linalg import SuperLU, splu
 
 from eitbench.numerics.compiled import compiled_kernels, scratch
 
-ByRows = tuple[np.ndarray, np.ndarray, np.ndarray]
+CsrArrays = tuple[np.ndarray, np.ndarray, np.ndarray]
 """Pointers, indices and values of a sparse matrix, as the kernels want it."""
 
 
-class Factors(NamedTuple):
+class LUFactors(NamedTuple):
     """L and U, for those who substitute themselves."""
 
-    row_place: np.ndarray
+    row_perm: np.ndarray
     """(n,) at which place in the order of elimination each row stands"""
-    column_place: np.ndarray
+    column_perm: np.ndarray
     """(n,) and each column"""
-    lower: ByRows
+    lower: CsrArrays
     """(n, n) L without its diagonal, which is 1"""
-    upper: ByRows
+    upper: CsrArrays
     """(n, n) U without its diagonal"""
     scale: np.ndarray
     """(n,) the inverse of U's diagonal"""
@@ -42,15 +42,15 @@ class SparseLU:
 
     Attributes
     ----------
-    factors : Factors
+    factors : LUFactors
         For those who substitute themselves.
     """
 
     def __init__(self, matrix: sp.csr_array) -> None:
-        factors = eliminated(matrix, "MMD_AT_PLUS_A")
+        factors = factorise_no_pivot(matrix, "MMD_AT_PLUS_A")
         L = sp.csr_array(sp.tril(factors.L, -1))
         U = sp.csr_array(sp.triu(factors.U, 1))
-        self.factors = Factors(factors.perm_r.astype(np.int64), factors.perm_c.astype(np.int64),
+        self.factors = LUFactors(factors.perm_r.astype(np.int64), factors.perm_c.astype(np.int64),
                                (L.indptr, L.indices, L.data), (U.indptr, U.indices, U.data),
                                1.0 / factors.U.diagonal())
 
@@ -68,7 +68,7 @@ class SparseLU:
         return result
 
 
-def eliminated(matrix: sp.csr_array | sp.csc_array, order: str) -> SuperLU:
+def factorise_no_pivot(matrix: sp.csr_array | sp.csc_array, order: str) -> SuperLU:
     """L U without pivoting; ``order`` of the columns by SuperLU's name, the rows in the same."""
     return splu(sp.csc_matrix(matrix), permc_spec=order, diag_pivot_thresh=0.0,
                 options={"SymmetricMode": True})

@@ -20,7 +20,7 @@ from eitbench import _check
 from eitbench.numerics.condensation import Condensation
 from eitbench.numerics.fem import basis as basis_on
 from eitbench.numerics.fem import element, facet_numbers, integral, product
-from eitbench.numerics.mesh import Mesh, as_set, checked_facets
+from eitbench.numerics.mesh import Mesh, facet_set, validate_facets
 from eitbench.physics.sensitivity import Sensitivity
 
 
@@ -206,7 +206,7 @@ class CompleteElectrodeModel:
 
 
 class _Wall(NamedTuple):
-    """Integrals over one electrode."""
+    """ScoreIntegrals over one electrode."""
 
     mass: sp.csr_array
     """(N, N) ∫ u φ"""
@@ -248,12 +248,12 @@ def _checked_electrodes(mesh: Mesh, electrodes: Sequence[np.ndarray]) -> list[np
         raise ValueError(f"mesh must be connected, got {pieces} separate pieces")
     if len(electrodes) < 2:
         raise ValueError(f"electrodes must be at least two, got {len(electrodes)}")
-    boundary = as_set(mesh.boundary_facets)
+    boundary = facet_set(mesh.boundary_facets)
     owner: dict[tuple[int, ...], int] = {}
     checked = []
     for number, facets in enumerate(electrodes):
         name = f"electrodes[{number}]"
-        facets = np.sort(checked_facets(name, facets, mesh), axis=1)
+        facets = np.sort(validate_facets(name, facets, mesh), axis=1)
         for facet in map(tuple, facets.tolist()):
             if facet not in boundary:
                 raise ValueError(f"{name} has facet {facet}, which is not on the mesh's boundary")

@@ -16,7 +16,7 @@ from skfem.helpers import grad
 from eitbench import _check
 from eitbench.numerics.fem import basis as basis_on
 from eitbench.numerics.fem import facet_numbers, integral, laplace
-from eitbench.numerics.mesh import Mesh, as_set, checked_facets
+from eitbench.numerics.mesh import Mesh, facet_set, validate_facets
 from eitbench.physics.transport import VelocityField
 
 _EDGES = np.array([[0, 1], [1, 2], [2, 0]])  # of a triangle; their middles are its nodes 3, 4, 5
@@ -176,11 +176,11 @@ def _wall_values(mesh: Mesh, basis: skfem.Basis,
         raise ValueError("walls must hold at least one pair of facets and velocity")
     value = np.zeros((basis.N, 2))
     on_wall = np.zeros(basis.N, dtype=bool)
-    boundary = as_set(mesh.boundary_facets)
+    boundary = facet_set(mesh.boundary_facets)
     rest = set(boundary)
     for i, (facets, velocity) in enumerate(walls):
-        facets = checked_facets(f"walls[{i}] must begin with facets, which", facets, mesh)
-        here = as_set(np.sort(facets, axis=1))
+        facets = validate_facets(f"walls[{i}] must begin with facets, which", facets, mesh)
+        here = facet_set(np.sort(facets, axis=1))
         if here - boundary:
             raise ValueError(f"walls[{i}] must hold facets of the boundary, "
                              f"got {min(here - boundary)}")

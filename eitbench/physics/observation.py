@@ -45,26 +45,26 @@ class LinearConductivity:
 class VoltageNoise:
     """Independent Gaussian noise (thesis 5.1.1), largest being that of the same injection.
 
-    std² = (relative·reading)² + (of_largest·largest voltage)² + floor². Without ``floor`` the noise
-    scales with the current.
+    std² = (relative·voltage)² + (relative_to_max·largest voltage)² + floor². Without ``floor`` the
+    noise scales with the current.
     """
 
     relative: float = 0.01
     """part of the reading, ≥ 0; the thesis has 0.01"""
-    of_largest: float = 0.001
+    relative_to_max: float = 0.001
     """part of the largest voltage of the injection, ≥ 0; the thesis has 0.001"""
     floor: float = 0.0
     """absolute std in V, ≥ 0; the thesis has none"""
 
     def __post_init__(self) -> None:
-        for name in ("relative", "of_largest"):
+        for name in ("relative", "relative_to_max"):
             _check.number(name, getattr(self, name), low=0.0)
         _check.number("floor", self.floor, low=0.0, units="V")
 
     def std(self, voltages: np.ndarray) -> np.ndarray:
         """Standard deviation (V) of each reading for noise-free ``voltages`` (..., L)."""
         largest = np.abs(voltages).max(axis=-1, keepdims=True)
-        of_both = (self.relative * voltages)**2 + (self.of_largest * largest)**2
+        of_both = (self.relative * voltages)**2 + (self.relative_to_max * largest)**2
         return np.sqrt(of_both + self.floor**2)
 
 
@@ -83,7 +83,7 @@ class ObservationModel:
     """Voltages for a nodal concentration on the CD mesh: V = R(c).
 
     The concentration is interpolated linearly to the EIT mesh, which does not conform, and turned
-    into a conductivity there. A concentration below ``smallest_concentration`` counts as that value
+    into a conductivity there. A concentration below ``min_concentration`` counts as that value
     with the law's slope there, so that σ stays positive whatever an estimator proposes.
 
     Parameters
@@ -92,23 +92,23 @@ class ObservationModel:
     interpolation : (n_eit, n_cd) sparse
         From CD nodes to EIT nodes, see `Mesh.interpolation_to`.
     conductivity : ConductivityLaw
-    smallest_concentration : float
+    min_concentration : float
         In mol/m³, > 0.
     """
 
     def __init__(self, cem: CompleteElectrodeModel, interpolation: sp.csr_array,
-                 conductivity: ConductivityLaw, smallest_concentration: float) -> None:
+                 conductivity: ConductivityLaw, min_concentration: float) -> None:
         self.cem = cem
         self.interpolation = interpolation
         self.conductivity = conductivity
-        self.smallest_concentration = _check.number(
-            "smallest_concentration", smallest_concentration, low=0.0, open_low=True,
+        self.min_concentration = _check.number(
+            "min_concentration", min_concentration, low=0.0, open_low=True,
             units="mol/m³")
 
     def with_contacts(self, contact_impedance: np.ndarray) -> ObservationModel:
         """The same with electrodes of these contact impedances (L,) in Ω·m², > 0."""
         return ObservationModel(self.cem.with_contacts(contact_impedance), self.interpolation,
-                                self.conductivity, self.smallest_concentration)
+                                self.conductivity, self.min_concentration)
 
     def transfer_resistance(self, concentration: np.ndarray) -> np.ndarray:
         """𝓡 (..., L, L) in Ω (Ω·m in 2D) for nodal ``concentration`` (..., n_cd) in mol/m³."""
@@ -142,4 +142,4 @@ class ObservationModel:
         shape = (*np.shape(concentration)[:-1], self.interpolation.shape[1])
         c = _check.array("concentration", concentration, shape, units="mol/m³")
         there = (self.interpolation @ c.reshape(-1, c.shape[-1]).T).T.reshape(*c.shape[:-1], -1)
-        return np.maximum(there, self.smallest_concentration)
+        return np.maximum(there, self.min_concentration)

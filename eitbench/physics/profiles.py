@@ -74,7 +74,7 @@ class VelocityModel:
                 raise ValueError(f"{name} must be ≥ 0 in m/s, got {getattr(self, name)!r}")
 
     @property
-    def size(self) -> int:
+    def n_parameters(self) -> int:
         """k, the number of parameters."""
         return len(self.basis)
 
@@ -99,19 +99,19 @@ class VelocityModel:
         return self.profiles.T @ (self.weights[:, None] * self.profiles)
 
     @property
-    def directions(self) -> list[PolynomialFlow]:
+    def basis_fields(self) -> list[PolynomialFlow]:
         """The k basis fields: dv/dθ_k."""
         return [PolynomialFlow(shape, self.half_width) for shape in self.basis]
 
     def field(self, parameters: np.ndarray | Sequence[float]) -> PolynomialFlow:
         """The velocity field with these ``parameters`` (k,) in m/s."""
-        theta = _check.array("parameters", parameters, (self.size,), units="m/s")
+        theta = _check.array("parameters", parameters, (self.n_parameters,), units="m/s")
         degree = max(map(len, self.basis))
         shapes = np.array([np.pad(shape, (0, degree - len(shape))) for shape in self.basis])
         return PolynomialFlow(tuple((theta @ shapes).tolist()), self.half_width)
 
 
-def parabola(half_width: float, mean_velocity: float, initial_std: float,
+def parabolic_model(half_width: float, mean_velocity: float, initial_std: float,
              walk_std: float) -> VelocityModel:
     """The parabolic profile with an unknown mean velocity, all in m/s: θ is that mean."""
     basis = ((1.5, 0.0, -1.5),)

@@ -22,7 +22,7 @@ from eitbench.numerics.mesh import Mesh
 from eitbench.numerics.sparse_lu import SparseLU
 
 VelocityField = Callable[[np.ndarray], np.ndarray]
-MANY = 16
+MIN_WIDE_COLUMNS = 16
 """From so many columns on they go through the sub-steps side by side."""
 
 
@@ -42,7 +42,8 @@ class EvolutionModel(NamedTuple):
 
 
 class Transport(Protocol):
-    """How a concentration moves in a time step: `ConvectionDiffusion`, or `AtRest` in `rest`."""
+    """Evolution of a concentration over a time step: `ConvectionDiffusion` or, in `stationary`,
+    `StationaryTransport`."""
 
     def __hash__(self) -> int: ...
 
@@ -221,7 +222,7 @@ class ConvectionDiffusion:
                  source: np.ndarray | None = None) -> np.ndarray:
         """All sub-steps on (n, batch) columns, perhaps with a ``source`` added to c a second."""
         load = None if source is None else self._mass @ source
-        if c.shape[1] >= MANY:
+        if c.shape[1] >= MIN_WIDE_COLUMNS:
             return self._advance_wide(c, before, after, load)
         f = 0.0 if load is None else load
         loads = [0.5 * f, 0.5 * f] + [f] * (self.substeps - 1)
@@ -231,11 +232,11 @@ class ConvectionDiffusion:
     @cached_property
     def _kernel_arguments(self) -> tuple[Any, ...]:
         """Matrices by rows, factors, nodes and rate, as `eitbench.numerics.kernels` wants them."""
-        row_place, column_place, lower, upper, scale = self._solver.factors
+        row_perm, column_perm, lower, upper, scale = self._solver.factors
         matrices = [(each.indptr, each.indices, each.data)
                     for each in (self._mass, self._explicit, self._implicit_inlet)]
-        unknown = self._free[np.argsort(column_place)]
-        return (*matrices, lower, upper, scale, row_place, unknown, self.inlet, self.substeps,
+        unknown = self._free[np.argsort(column_perm)]
+        return (*matrices, lower, upper, scale, row_perm, unknown, self.inlet, self.substeps,
                 self.substeps / self.time_step)
 
     def _advance_wide(self, c: np.ndarray, before: np.ndarray, after: np.ndarray,

@@ -342,7 +342,8 @@ def _row(whole: dict[str, Any], seeds: set[str], zero: dict[str, float], known: 
 
 def _identity_cells(record: dict[str, Any], environment: str, note: str) -> dict[str, Any]:
     return {"class": record_category(record), "environment": environment, "note": note,
-            "rank": None, **{name: record[name] for name in ("method", "version", "title", "official")}}
+            "rank": None,
+            **{name: record[name] for name in ("method", "version", "title", "official")}}
 
 
 def _sort_key(row: MethodRow) -> tuple[bool, float, str]:

@@ -156,7 +156,8 @@ def sparkline(three: tuple[float, float, float], px: Axis, *, mark: float | None
     value, a, b = (min(end if math.isfinite(end) else three[0], px.high) for end in three)
     strokes = "".join(f"M{px(min(one, px.high)):.1f} 2V12" for one in each)
     return Markup(f'<svg class="cell" viewBox="0 0 {CELL_WIDTH_PX} 14" aria-hidden="true">'
-                  f'{_vertical_line(px, mark)}<line x1="{px(a):.1f}" x2="{px(b):.1f}" y1="7" y2="7"/>'
+                  f'{_vertical_line(px, mark)}'
+                  f'<line x1="{px(a):.1f}" x2="{px(b):.1f}" y1="7" y2="7"/>'
                   + (f'<path class="each" d="{strokes}"/>' if strokes else "")
                   + f'<circle cx="{px(value):.1f}" cy="7" r="3"/></svg>')
 
@@ -169,7 +170,8 @@ def sparkline_axis(px: Axis, *, mark: float | None = None) -> Markup:
     labels = "".join(_text(px(tick), 14, "middle", _format_tick(tick).replace("-", "−"))
                      for tick in (ticks[:1] if far else []) + ticks[-1:])
     return Markup(f'<svg class="cell axis" viewBox="0 0 {CELL_WIDTH_PX} 16" aria-hidden="true">'
-                  f'<path d="M{px.begin} 0H{px.end}{strokes}"/>{_vertical_line(px, mark, 6)}{labels}</svg>')
+                  f'<path d="M{px.begin} 0H{px.end}{strokes}"/>{_vertical_line(px, mark, 6)}'
+                  f'{labels}</svg>')
 
 
 def truncate(name: str, letters: int) -> str:

@@ -13,7 +13,7 @@ from eitbench.bench.run import Job
 from eitbench.bench.store import EpisodeStore
 from eitbench.bench.text import seed_ranges
 from eitbench.bench.variants import as_typed, flat
-from eitbench.data.seeds import name_seed
+from eitbench.data.seeds import format_seed
 
 _METHOD_OPTIONS = {"estimation": "--baseline", "injection": "--policy"}
 """Track -> the option of `eitbench run` that names its methods."""
@@ -82,4 +82,4 @@ def debug_command(failure: Failure, jobs: Iterable[Job]) -> str:
 
 def _key(job: Job) -> tuple[str, str, str]:
     """Environment, method and seed, as records name them."""
-    return job.environment.name, job.load().name, name_seed(job.seed)
+    return job.environment.name, job.load().name, format_seed(job.seed)

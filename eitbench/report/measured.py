@@ -21,7 +21,7 @@ from eitbench.bench.measured import N_PLOTTED_FRAMES
 from eitbench.envs.rendering import draw_electrodes, draw_field
 from eitbench.measured.calibration import electrode_misfits
 from eitbench.measured.segmentation import ktc_score, require_round_tank, segment
-from eitbench.physics.rest import AtRest
+from eitbench.physics.stationary import StationaryTransport
 from eitbench.report.templates import data_uri, render_template
 
 if TYPE_CHECKING:
@@ -61,7 +61,7 @@ def write_report(path: Path, env: MeasuredEnv, runs: Sequence[MeasuredRun],
 
 
 def _is_at_rest(env: MeasuredEnv) -> bool:
-    return isinstance(env.task.transport, AtRest)
+    return isinstance(env.task.transport, StationaryTransport)
 
 
 def _facts(env: MeasuredEnv) -> dict[str, str]:

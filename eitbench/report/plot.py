@@ -17,9 +17,9 @@ from eitbench.bench.evaluation import environment_of, method_given
 from eitbench.bench.playing import can_play, estimates, injections
 from eitbench.bench.scores import scores
 from eitbench.bench.text import mean_and_interval
-from eitbench.data.episodes import simulate, truth_discretisation
-from eitbench.data.recordings import region_operators
-from eitbench.data.seeds import name_seed, parse_seeds
+from eitbench.data.episode_cache import region_operators
+from eitbench.data.episodes import cached_truth_model, simulate
+from eitbench.data.seeds import format_seed, parse_seeds
 from eitbench.envs.injection import InjectionEnv
 from eitbench.envs.rendering import colour_range, draw_electrodes, draw_field
 from eitbench.numerics.mesh import Mesh
@@ -98,7 +98,7 @@ def episode(method: Any, env: str | gym.Env, seed: int | str, *,
     _check.integer("times", times, low=1, high=world_of.schedule.scored_steps)
     wanted = list(map(int, np.linspace(world_of.warm_up + 1, world_of.n_steps, times + 2)[1:-1]))
     found = states_at(made, loaded, number, wanted)
-    mesh = truth_discretisation(world_of).transport.mesh
+    mesh = cached_truth_model(world_of).transport.mesh
     interpolation, mass = region_operators(world_of)
     task = made.task
     figure, axes = plt.subplots(times, 2, figsize=_size(task, times, 2), squeeze=False,
@@ -113,7 +113,7 @@ def episode(method: Any, env: str | gym.Env, seed: int | str, *,
     for ax in axes.flat:
         ax.label_outer()
     figure.colorbar(last, ax=axes, label=FIELD_LABEL, extend="both")
-    figure.suptitle(f"{asked.id}, {name_seed(number)}", fontsize=10)
+    figure.suptitle(f"{asked.id}, {format_seed(number)}", fontsize=10)
     return axes
 
 

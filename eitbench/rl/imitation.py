@@ -52,7 +52,7 @@ def imitate(model: Any, world: InjectionEnv, options: dict[str, Any], reward_sca
               desc=f"learning from {teacher.name}") as bar:
         for turn in range(settings["rounds"]):
             for _ in range(settings["episodes"]):
-                episode = int(random.integers(world.pool.most))
+                episode = int(random.integers(world.pool.max_episodes))
                 stream = np.random.default_rng(int(random.integers(2**63)))
                 seen, labels, rewards = rollout(world, teacher, episode, stream,
                                                 act if turn else None)

@@ -225,7 +225,8 @@ def rewards_of(policy: str, world: InjectionEnv, path: Path) -> np.ndarray:
     method = load_suited("reference", policy, world.rules)
     rewards = np.array([
         rollout(world, method, episode, np.random.default_rng(episode))[2]
-        for episode in tqdm(range(world.pool.most), desc=f"rewards of {policy}", unit="episode",
+        for episode in tqdm(range(world.pool.max_episodes), desc=f"rewards of {policy}",
+                            unit="episode",
                             disable=None)])
     write_atomically(path, npy(rewards))
     return rewards

@@ -1,8 +1,29 @@
-"""Floor 2: what is simulated. A world is put together from parts, every number with its source."""
+"""Layer 2: configurations of simulations, composed of parts; every number has its source."""
 
+from typing import Any
+
+from eitbench.worlds.random_streams import EpisodeStreams, episode_streams
 from eitbench.worlds.registry import Entry, entries, entry, register
-from eitbench.worlds.streams import Randomness, randomness
-from eitbench.worlds.world import Discretisation, Flow, History, Prior, Target, Vessel, World
+from eitbench.worlds.stored_names import warn_renamed
+from eitbench.worlds.world import (
+    Discretisation,
+    Flow,
+    Prior,
+    Target,
+    TruthTrajectory,
+    Vessel,
+    World,
+)
 
-__all__ = ["Discretisation", "Entry", "Flow", "History", "Prior", "Randomness", "Target", "Vessel",
-           "World", "entries", "entry", "randomness", "register"]
+__all__ = ["Discretisation", "Entry", "EpisodeStreams", "Flow", "Prior", "Target",
+           "TruthTrajectory", "Vessel", "World", "entries", "entry", "episode_streams", "register"]
+
+
+def __getattr__(name: str) -> Any:
+    """Return a public object by its earlier name."""
+    for old, new in (("History", TruthTrajectory), ("Randomness", EpisodeStreams),
+                     ("randomness", episode_streams)):
+        if name == old:
+            warn_renamed(old, new.__name__)
+            return new
+    raise AttributeError(f"module 'eitbench.worlds' has no attribute {name!r}")

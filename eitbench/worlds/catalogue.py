@@ -1,375 +1,396 @@
-"""All registered environments: their worlds, settings and page text, in the order of the thesis.
+"""All built-in environments: their worlds, settings and page text, in the order of the thesis.
 
-[T] marks numbers of the thesis, [ours] the project's own choices.
+[T] marks numbers of the thesis, [ours] the project's choices.
 """
 
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
-from eitbench.worlds.bodies import Ball, Cylinders
+from eitbench.worlds.bodies import Cylinders, ResistiveDisc
 from eitbench.worlds.flows import (
-    DrawnFlow,
     FlowPastBulge,
     LaminarFlow,
     NoFlow,
+    RandomFlow,
+    RandomWalkFlow,
     StirredFlow,
-    WanderingFlow,
 )
 from eitbench.worlds.instrument import Instrument
 from eitbench.worlds.registry import register
-from eitbench.worlds.schedule import AroundTheTank, OnePair, RingsInTurn, Schedule
-from eitbench.worlds.slugs import NowAndThen, Slugs
+from eitbench.worlds.schedule import (
+    RotatingRingPattern,
+    Schedule,
+    SinglePairPattern,
+    TankOppositeDiagonalPattern,
+)
+from eitbench.worlds.slugs import DeadTimePoissonArrivals, Slugs
 from eitbench.worlds.vessels import Bulge, PlanePipe, RoundPipe, RoundTank
 from eitbench.worlds.world import Prior, World
+
+register_example = partial(register, group="thesis examples")
+register_extension = partial(register, group="extensions")
+register_injection = partial(register, group="injection", track="injection")
 
 # -- 2D pipe (thesis 5.1) --
 
 PIPE_2D = World("Pipe2D", PlanePipe(), LaminarFlow(), Slugs())
 """A straight plane channel with laminar flow (thesis 5.1.1, Figs 5.1–5.6).
 
-One injection a time step; in the 16 injections of a frame the fluid moves 36 cm on average, almost
-the whole pipe.
+Each time step has one injection. During the 16 injections of a frame the fluid moves 36 cm on
+average, almost the length of the pipe.
 """
 
-PIPE_2D_ABOUT = """
-Fluid streams through a straight 2D pipe, 40 cm long and 10 cm wide, at 4.5 m/s on average; slugs of
-higher and lower concentration enter at random. Sixteen electrodes on the walls, one current
-injection every 5 ms: while a frame of 16 injections is measured, the fluid moves on by 36 cm. From
-the voltages of each injection, and a model of flow, estimate the concentration everywhere (Seppänen
-2005, ch. 5).
+PIPE_2D_TEXT = """
+Fluid flows through a straight 2D pipe, 40 cm long and 10 cm wide, at 4.5 m/s on average. Slugs,
+volumes of higher or lower concentration, enter at random times. Sixteen electrodes on the walls
+inject one current pattern every 5 ms: during a frame of 16 injections the fluid moves 36 cm. The
+task: estimate the concentration field from the voltages of each injection and a flow model
+(Seppänen 2005, ch. 5).
 
-The homogeneous estimate scores about 0.02, a Kalman filter about 0.0045.
-`assume={"mean_velocity": 4.0}` tells estimators another velocity than the true one.
+The homogeneous estimate has an error of about 0.02, a Kalman filter of about 0.0045.
+`assume={"mean_velocity": 4.0}` gives estimators another velocity than the true one.
 """
-LAGGED = "\nHere the state of four injections before is asked for.\n"
-WHOLE = "\nHere every state is asked for, once the whole record has been played.\n"
+FIXED_LAG_TEXT = "\nThe task requests the state of four injections before.\n"
+SMOOTHING_TEXT = "\nThe task requests every state after the last measurement.\n"
 
-register(PIPE_2D, "eitbench/Pipe2D-v0", about=PIPE_2D_ABOUT)
-register(PIPE_2D, "eitbench/Pipe2DFixedLag-v0", about=PIPE_2D_ABOUT + LAGGED, lag=4)
-register(PIPE_2D, "eitbench/Pipe2DSmoothing-v0", about=PIPE_2D_ABOUT + WHOLE, lag="all")
+register_example(PIPE_2D, "eitbench/Pipe2D-v0", description=PIPE_2D_TEXT, is_starting_point=True)
+register_example(PIPE_2D, "eitbench/Pipe2DFixedLag-v0", lag=4,
+                 description=PIPE_2D_TEXT + FIXED_LAG_TEXT)
+register_example(PIPE_2D, "eitbench/Pipe2DSmoothing-v0", lag="all", is_starting_point=True,
+                 description=PIPE_2D_TEXT + SMOOTHING_TEXT)
 
 # -- 2D pipe with another mean velocity than estimators assume (5.1.2, Figs 5.7, 5.8) --
 
 PIPE_2D_BIASED = World("Pipe2DBiasedVelocity", PlanePipe(),
-                       DrawnFlow(velocity_range=(2.5, 7.0)), Slugs())
-"""The thesis keeps the truth at 4.5 m/s and varies what is assumed; so that nobody gains by knowing
-the one true velocity, here the truth varies [ours]. What methods score: ``docs/velocity.md``."""
+                       RandomFlow(velocity_range=(2.5, 7.0)), Slugs())
+"""The thesis fixes the true velocity, 4.5 m/s, and varies the assumed one. Here the true velocity
+varies, so that methods cannot be tuned to it [ours]. Scores: ``docs/velocity.md``."""
 
-register(PIPE_2D_BIASED, "eitbench/Pipe2DBiasedVelocity-v0", about="""
-The pipe of `eitbench/Pipe2D-v0`, but the mean velocity that estimators are told, 4.5 m/s, is not
-the true one, which is drawn for each episode from 2.5 … 7 m/s (Seppänen 2005, 5.1.2, Figs 5.7 and
-5.8). How much does a method suffer from a wrong model of the flow?
+register_example(PIPE_2D_BIASED, "eitbench/Pipe2DBiasedVelocity-v0", description="""
+The pipe of `eitbench/Pipe2D-v0` with a wrong mean velocity in the task: the task specifies 4.5 m/s,
+and the true velocity is drawn for each episode from 2.5 … 7 m/s (Seppänen 2005, 5.1.2, Figs 5.7 and
+5.8). The environment measures how much an error of the flow model increases the estimation error.
 
-In the thesis the truth is 450 cm/s and the assumed velocity varies; that is
-`gym.make(id, world={"flow": {"velocity_range": [4.5, 4.5]}}, assume={"mean_velocity": 2.0})` here.
-`assume={"profile": "plug"}` or `"power-law"` (exponent 1/7) lets the model believe in another
-profile.
+In the thesis the true velocity is 450 cm/s and the assumed velocity varies:
+`gym.make(id, world={"flow": {"velocity_range": [4.5, 4.5]}}, assume={"mean_velocity": 2.0})`.
+`assume={"profile": "plug"}` or `"power-law"` (exponent 1/7) selects another profile for the model.
 """)
 
 # -- 2D pipe with a parabolic flow of unknown mean --
 
-ASKED = """
-The axial velocity is written as v̂(y) = Σ θ_k φ_k(y/R); `task.velocity` holds the φ_k, what is
-believed of θ at first, and how fast it may change. On the leaderboard the errors of concentration
-and flow are ẽ_c and ẽ_v; ẽ_c ranks.
+VELOCITY_TEXT = """
+The axial velocity is written as v̂(y) = Σ θ_k φ_k(y/R). `task.velocity` contains the φ_k, the prior
+of θ and the rate at which θ may change. The leaderboard shows the errors of concentration and flow,
+ẽ_c and ẽ_v, and ranks by ẽ_c.
 """
 
 PIPE_2D_UNKNOWN = World("Pipe2DUnknownVelocity", PlanePipe(),
-                        DrawnFlow(velocity_range=(3.0, 6.5), profiles="mean"), Slugs())
-"""Believed at first: 4.5 ± 1 m/s [ours]."""
+                        RandomFlow(velocity_range=(3.0, 6.5), profiles="mean"), Slugs())
+"""The prior of the mean velocity is 4.5 ± 1 m/s [ours]."""
 
-register(PIPE_2D_UNKNOWN, "eitbench/Pipe2DUnknownVelocity-v0", seeds="test:0-5", about=f"""
-The pipe of `eitbench/Pipe2D-v0`, but the flow is not known: parabolic, with a mean of 3 … 6.5 m/s
-drawn for each episode. Estimate the concentration and the mean velocity from the voltages (Seppänen
-2005, 6.2, example 1).
-{ASKED}""")
+register_example(PIPE_2D_UNKNOWN, "eitbench/Pipe2DUnknownVelocity-v0", test_seeds="test:0-5",
+                 is_starting_point=True, description=f"""
+The pipe of `eitbench/Pipe2D-v0` with an unknown parabolic flow, whose mean is drawn for each
+episode from 3 … 6.5 m/s. Estimate the concentration and the mean velocity from the voltages
+(Seppänen 2005, 6.2, example 1).
+{VELOCITY_TEXT}""")
 
 # -- 2D pipe with a mean velocity that changes in time (6.3, Fig. 6.3) --
 
 PIPE_2D_TIME_VARYING = World(
     "Pipe2DTimeVaryingVelocity", PlanePipe(),
-    DrawnFlow(velocity_range=(3.5, 5.5), swing_range=(0.2, 0.35), profiles="mean",
-              velocity_walk=0.1), Slugs())
-"""A sine of 20 … 35 % about 3.5 … 5.5 m/s; estimators are told that the flow changes [ours]."""
+    RandomFlow(velocity_range=(3.5, 5.5), oscillation_range=(0.2, 0.35), profiles="mean",
+               velocity_walk=0.1), Slugs())
+"""A sine of 20 … 35 % about 3.5 … 5.5 m/s; the task's velocity model is a random walk [ours]."""
 
-register(PIPE_2D_TIME_VARYING, "eitbench/Pipe2DTimeVaryingVelocity-v0", seeds="test:0-5", about=f"""
+register_example(PIPE_2D_TIME_VARYING, "eitbench/Pipe2DTimeVaryingVelocity-v0",
+                 test_seeds="test:0-5", description=f"""
 The pipe of `eitbench/Pipe2D-v0` with a parabolic flow whose mean is a sine in time of 20 … 35 %,
 drawn for each episode. Estimate the concentration and the mean velocity from the voltages (Seppänen
 2005, 6.3, example 2).
-{ASKED}""")
+{VELOCITY_TEXT}""")
 
 # -- 2D pipe with a non-symmetric flow --
 
 PIPE_2D_SKEWED = World(
     "Pipe2DSkewedVelocity", PlanePipe(),
-    DrawnFlow(velocity_range=(4.0, 5.0), skewness_range=(0.6, 1.0), profiles="three",
-              velocity_walk=0.005), Slugs())
-"""The truth is (1 − η²)·exp(kη), which no combination of the three profiles equals: the fastest
-fluid is 0.28 R to 0.41 R off the axis. Of a steady flow three numbers are to be told [ours]."""
+    RandomFlow(velocity_range=(4.0, 5.0), skewness_range=(0.6, 1.0), profiles="three",
+               velocity_walk=0.005), Slugs())
+"""The true profile is (1 − η²)·exp(kη), which no combination of the three profiles equals; its
+maximum is 0.28 R to 0.41 R off the axis. The steady flow has three parameters [ours]."""
 
-register(PIPE_2D_SKEWED, "eitbench/Pipe2DSkewedVelocity-v0", seeds="test:0-5", about=f"""
-The pipe of `eitbench/Pipe2D-v0` with a flow that is not symmetric, drawn for each episode. It is
-estimated as a combination of three profiles, of which none equals it: the parabola, a skew cubic,
+register_example(PIPE_2D_SKEWED, "eitbench/Pipe2DSkewedVelocity-v0", test_seeds="test:0-5",
+                 description=f"""
+The pipe of `eitbench/Pipe2D-v0` with a non-symmetric flow, drawn for each episode. It is estimated
+as a combination of three profiles, which cannot represent it exactly: the parabola, a skew cubic,
 and a quartic that flattens or sharpens the profile without a net flux (Seppänen 2005, 6.4, example
 3).
-{ASKED}""")
+{VELOCITY_TEXT}""")
 
-# -- The 2D pipe with a dent in its lower wall --
+# -- 2D pipe with a bulge in its lower wall --
 
 PIPE_2D_OBSTACLE = World("Pipe2DObstacle", PlanePipe(bulge=Bulge()), FlowPastBulge(), Slugs())
-"""Behind the bulge the fluid recirculates over more than half of the pipe. All numbers are ours."""
+"""Behind the bulge the fluid recirculates over more than half of the pipe. All numbers [ours]."""
 
-register(PIPE_2D_OBSTACLE, "eitbench/Pipe2DObstacle-v0", about="""
-The pipe of `eitbench/Pipe2D-v0` with a bulge in its lower wall. The flow separates behind it and
-recirculates; it solves the steady Navier–Stokes equations. Estimators know the walls, but their
-model assumes a parabola between them at each place; with `assume={"flow": "real"}` they are given
-the real flow. How far does the simple model of the thesis carry, and what is gained by a better one
-(Seppänen 2005, 5.1.1, names better fluid models as the next step)?
+register_extension(PIPE_2D_OBSTACLE, "eitbench/Pipe2DObstacle-v0", description="""
+The pipe of `eitbench/Pipe2D-v0` with a bulge in its lower wall. The flow separates behind the bulge
+and recirculates; it solves the steady Navier–Stokes equations. The task contains the exact walls
+and a flow model that is a parabola between them at each x; `assume={"flow": "real"}` selects the
+true flow. The environment measures the loss by the simple model of the thesis and the benefit of a
+better one (Seppänen 2005, 5.1.1, names better fluid models as the next step).
 """)
 
 # -- Robustness variants of the 2D pipe --
 
-HOME = "eitbench/Pipe2D-v0"
-REST = f"""
-All else is as in `{HOME}`, and the task is the same: estimators are told the same model, noise and
-velocity, and what was learned for that pipe suits here. The robustness board shows what they score
-here and there side by side (`docs/robustness.md`). `true_model_smoother` is told the true flow, and
-of what has changed nothing else.
+NOMINAL_ID = "eitbench/Pipe2D-v0"
+VARIANT_TEXT = f"""
+All else is as in `{NOMINAL_ID}`, and the task is the same: it specifies the same model, noise and
+velocity, and methods trained for that pipe are compatible. The robustness table compares the scores
+in both (`docs/robustness.md`). `true_model_smoother` receives the true flow and no other change.
 """
 
 
-def shifted(name: str, about: str, **parts: Any) -> World:
-    """The thesis' pipe with these parts in place of its own, made playable under this name."""
+def register_variant(name: str, description: str, **parts: Any) -> World:
+    """Register the thesis' pipe with other ``parts`` under this name, and return it."""
     world = replace(PIPE_2D, **parts)
-    if world.fluid != PIPE_2D.fluid:  # else it shares the episodes of home
+    if world.truth_config != PIPE_2D.truth_config:  # else it shares episodes with the nominal one
         world = replace(world, name=name)
-    register(world, f"eitbench/{name}-v0", home=HOME, about=about + REST)
+    register(world, f"eitbench/{name}-v0", nominal=NOMINAL_ID, group="robustness variants",
+             description=description + VARIANT_TEXT)
     return world
 
 
-PIPE_2D_SHORT_SLUGS = shifted(
-    "Pipe2DShortSlugs", target=Slugs(duration=(3e-3, 7e-3)), about="""
-Slugs pass in half the time: the standard deviation of one is 3 to 7 ms, at home 6 to 14 ms. Who
-expects the inflow to go on as it was is wrong sooner.
+PIPE_2D_SHORT_SLUGS = register_variant(
+    "Pipe2DShortSlugs", target=Slugs(time_std=(3e-3, 7e-3)), description="""
+Slugs pass in half the time: the standard deviation of a slug is 3 to 7 ms, in the nominal
+environment 6 to 14 ms. Priors that assume slow changes of the inflow are wrong sooner.
 """)
 
-PIPE_2D_STRONG_SLUGS = shifted(
-    "Pipe2DStrongSlugs", target=Slugs(strength=(0.33, 0.60)), about="""
-Slugs are half as strong again: at its centre one changes the logarithm of the concentration by 0.33
-to 0.60, at home by 0.22 to 0.40. Voltages are less linear in that, and priors expect less.
+PIPE_2D_STRONG_SLUGS = register_variant(
+    "Pipe2DStrongSlugs", target=Slugs(log_amplitude=(0.33, 0.60)), description="""
+Slugs are 1.5 times as strong: at its centre a slug changes the logarithm of the concentration by
+0.33 to 0.60, in the nominal environment by 0.22 to 0.40. Voltages are less linear in this range,
+and priors expect smaller changes.
 """)
 
-PIPE_2D_DOUBLE_NOISE = shifted(
-    "Pipe2DDoubleNoise", instrument=Instrument(untold_noise=2.0), about="""
-The voltmeters' noise is twice what estimators are told. What flows in an episode is what flows at
-home.
+PIPE_2D_DOUBLE_NOISE = register_variant(
+    "Pipe2DDoubleNoise", instrument=Instrument(noise_mismatch=2.0), description="""
+The measurement noise is twice that which the task specifies. The concentration of each episode is
+the same as in the nominal environment.
 """)
 
-PIPE_2D_OTHER_VELOCITY = shifted(
-    "Pipe2DOtherVelocity", flow=DrawnFlow(velocity_range=(4.05, 4.95)), about="""
-The mean velocity, 4.5 m/s as told, is drawn for each episode within 10 % of that, from 4.05 to 4.95
-m/s. In `eitbench/Pipe2DBiasedVelocity-v0` it is from 2.5 to 7 m/s.
+PIPE_2D_OTHER_VELOCITY = register_variant(
+    "Pipe2DOtherVelocity", flow=RandomFlow(velocity_range=(4.05, 4.95)), description="""
+The mean velocity, 4.5 m/s in the task, is drawn for each episode within 10 % of that, from 4.05 to
+4.95 m/s. In `eitbench/Pipe2DBiasedVelocity-v0` the range is 2.5 to 7 m/s.
 """)
 
-PIPE_2D_OTHER_CONTACTS = shifted(
-    "Pipe2DOtherContacts", instrument=Instrument(contact_spread=0.5), about="""
-The contact impedance of each electrode is drawn for each episode within 50 % of what is told, from
-1 to 3 mΩ·m². Voltages are those of the complete electrode model with these impedances.
+PIPE_2D_OTHER_CONTACTS = register_variant(
+    "Pipe2DOtherContacts", instrument=Instrument(contact_impedance_spread=0.5), description="""
+The contact impedance of each electrode is drawn for each episode within 50 % of the value in the
+task, from 1 to 3 mΩ·m². Voltages follow the complete electrode model with these impedances.
 """)
 
-PIPE_2D_OTHER_INLET = shifted(
-    "Pipe2DOtherInlet", target=Slugs(width=(6e-3, 9e-3), reach=(0.7, 0.95)), about="""
-Slugs are narrow and enter near the walls, where the fluid is slow: their centres lie 0.7 to 0.95 R
-from the axis, at home 0 to 0.7 R, and their standard deviation across is 6 to 9 mm, at home 10 to
-25 mm.
+PIPE_2D_OTHER_INLET = register_variant(
+    "Pipe2DOtherInlet", target=Slugs(transverse_std=(6e-3, 9e-3), radial_range=(0.7, 0.95)),
+    description="""
+Slugs are narrow and enter near the walls, where the fluid is slow: their centres are 0.7 to 0.95 R
+from the axis, in the nominal environment 0 to 0.7 R, and their transverse standard deviation is 6
+to 9 mm, in the nominal environment 10 to 25 mm.
 """)
 
 # -- 3D pipe (5.2, Fig. 5.10) --
 
 PIPE_3D = World("Pipe3D", RoundPipe(), LaminarFlow(), Slugs(),
-                schedule=Schedule(scored_steps=48, pattern=RingsInTurn()))
-"""The page at hand shows the figure only: times, velocity and noise are those of the thesis' 2D
-pipe. Three frames are scored [ours]."""
+                schedule=Schedule(scored_steps=48, pattern=RotatingRingPattern()))
+"""The available page of the thesis shows the figure only: times, velocity and noise are those of
+its 2D pipe. Three frames are scored [ours]."""
 
-PIPE_3D_ABOUT = """
-Fluid streams through a round pipe, 40 cm long and 10 cm wide, at 4.5 m/s on average; slugs of
-higher and lower concentration enter at random. Four rings of eight electrodes on the wall, one
-current injection every 5 ms. From the voltages of each injection, and a model of flow, estimate the
-concentration everywhere (Seppänen 2005, 5.2, Fig. 5.10).
+PIPE_3D_TEXT = """
+Fluid flows through a round pipe, 40 cm long and 10 cm wide, at 4.5 m/s on average; slugs of higher
+or lower concentration enter at random times. Four rings of eight electrodes on the wall inject one
+current pattern every 5 ms. Estimate the concentration field from the voltages of each injection and
+a flow model (Seppänen 2005, 5.2, Fig. 5.10).
 
-The first use of a seed simulates its truth (one to two minutes), which is then kept on disk;
-`eitbench bank` does so for many seeds ahead of time.
+The first use of a seed simulates its ground truth (one to two minutes) and stores it in the cache;
+`eitbench bank` simulates many seeds in advance.
 """
 
-register(PIPE_3D, "eitbench/Pipe3D-v0", seeds="test:0-5", about=PIPE_3D_ABOUT)
-register(PIPE_3D, "eitbench/Pipe3DSmoothing-v0", seeds="test:0-5", lag="all",
-         about=PIPE_3D_ABOUT + WHOLE)
+register_example(PIPE_3D, "eitbench/Pipe3D-v0", test_seeds="test:0-5", is_starting_point=True,
+                 description=PIPE_3D_TEXT)
+register_example(PIPE_3D, "eitbench/Pipe3DSmoothing-v0", test_seeds="test:0-5", lag="all",
+                 description=PIPE_3D_TEXT + SMOOTHING_TEXT)
 
-# -- The stirred tank (thesis 7.1) --
+# -- Stirred tank (thesis 7.1) --
 
 ROTATING_TANK_2D = World(
-    "RotatingTank2D", RoundTank(), StirredFlow(), Ball(),
-    schedule=Schedule(time_step=0.025, scored_steps=64, pattern=OnePair(), warm_up=16),
+    "RotatingTank2D", RoundTank(), StirredFlow(), ResistiveDisc(),
+    schedule=Schedule(time_step=0.025, scored_steps=64, pattern=SinglePairPattern(), warm_up=16),
     prior=Prior(nodal_std=0.15, initial_std=0.25, initial_length=0.02))
-"""The thesis gives neither sizes nor times: all numbers are ours. The pipe's nodal noise of 0.02
-trusts the model, which is wrong as in the thesis, so far that a ball near the stirrer's circle,
-where the flow shears most, is lost (dev episodes; ``docs/tanks.md``)."""
+"""The thesis gives neither sizes nor times: all numbers [ours]. With the pipe's nodal noise of 0.02
+a filter trusts the model too much, which is wrong as in the thesis, and loses a disc near the
+stirrer's circle, where the flow shears most (dev episodes; ``docs/tanks.md``)."""
 
-register(ROTATING_TANK_2D, "eitbench/RotatingTank2D-v0", about="""
-A flat round tank of stirred saline carries a ball round that hardly conducts; sixteen electrodes on
-the wall. One pair of them injects all the time. A stationary image of one injection shows nothing,
-but the flow carries the target through the pair's field, and a filter that knows the flow can
-follow it (Seppänen 2005, 7.1, Figs 7.2 and 7.3).
+register_example(ROTATING_TANK_2D, "eitbench/RotatingTank2D-v0", description="""
+The flow in a flat round tank of stirred saline carries a ball with a low conductivity; sixteen
+electrodes are on the wall, and one pair of them injects all the time. A stationary image of one
+injection shows nothing, but the flow carries the target through the field of the pair, and a filter
+with a flow model can track it (Seppänen 2005, 7.1, Figs 7.2 and 7.3).
 
-The truth is a rigid ball on a path of its own; the model in `env.unwrapped.task` is a liquid
-without any ball, in which concentration is carried and spreads, as in the thesis. The ball begins
-between 0.25 and 0.48 of the radius from the middle, at any angle; the flow is steady.
+The truth is a rigid ball with a path of its own; the model in `env.unwrapped.task` is a liquid
+without a ball, in which concentration is advected and diffuses, as in the thesis. The ball starts
+between 0.25 and 0.48 of the radius from the centre, at any angle; the flow is steady.
 """)
 
-# -- The tank at rest (thesis 7.2) --
+# -- Stationary tank (thesis 7.2) --
 
 STATIONARY_TANK_2D = World(
     "StationaryTank2D", RoundTank(), NoFlow(), Cylinders(),
-    schedule=Schedule(time_step=0.02, scored_steps=32, pattern=AroundTheTank(), warm_up=0,
-                      calibration=1),
+    schedule=Schedule(time_step=0.02, scored_steps=32, pattern=TankOppositeDiagonalPattern(),
+                      warm_up=0, calibration=1),
     prior=Prior(nodal_std=0.0, initial_std=0.5, initial_length=0.02))
-"""The evolution model is c⁺ = c with no noise [T]; that neighbours are alike stands in Γ_{0|0} [T],
-a smoothness prior. Since the estimate is asked for from the first injection on, ĉ_bh comes from
-that injection alone. Two frames of 16 [ours]."""
+"""The evolution model is c⁺ = c without noise [T]; Γ_{0|0} is a smoothness prior [T]. Scores begin
+with the first injection, so ĉ_bh is fitted to that injection alone. Two frames of 16 [ours]."""
 
-register(STATIONARY_TANK_2D, "eitbench/StationaryTank2D-v0", about="""
-Two metal cylinders stand in a flat round tank of saline; nothing moves. Sixteen electrodes on the
-wall, one injection after another: estimate the concentration (which stands for the conductivity)
-from the first injection on. A Kalman filter with F = I and a smoothness prior in Γ_{0|0} has found
-both cylinders after about five injections (Seppänen 2005, 7.2, Fig. 7.4). Both cylinders are drawn
-anew for each episode.
+register_example(STATIONARY_TANK_2D, "eitbench/StationaryTank2D-v0", is_starting_point=True,
+                 description="""
+Two stationary metal cylinders are in a flat round tank of saline. Sixteen electrodes on the wall
+inject one current pattern after another: estimate the concentration (which represents the
+conductivity) from the first injection on. A Kalman filter with F = I and a smoothness prior in
+Γ_{0|0} finds both cylinders after about five injections (Seppänen 2005, 7.2, Fig. 7.4). Both
+cylinders are drawn for each episode.
 """)
 
 # -- 2D pipe in which an agent injects --
 
 PIPE_2D_CURRENTS = World("Pipe2D", PIPE_2D.vessel, PIPE_2D.flow, PIPE_2D.target,
-                         Instrument(noise_floor=2e-4, limit="Linf"))
+                         Instrument(noise_floor=2e-4, current_norm="Linf"))
 """A source for each electrode; with relative noise alone the amplitude would not matter [ours]."""
 
-INJECTION_ABOUT = """
-The pipe of `eitbench/Pipe2D-v0`; here the agent chooses at every step how the current flows. A
-Kalman filter inside takes in the voltages and estimates the concentration; it is the same for every
-agent, so that agents differ only in what they inject.
+INJECTION_TEXT = """
+The pipe of `eitbench/Pipe2D-v0`, where the agent chooses the current pattern at every step. A
+Kalman filter inside the environment processes the voltages and estimates the concentration. All
+agents use the same filter, so that they differ only in their injections.
 """
 
-register(PIPE_2D, "eitbench/Pipe2DInjection-v0", track="injection", about=f"""{INJECTION_ABOUT}
-This is the reference case, not a competition: one pair near the inlet, injected for ever, is as
-good as anything (what is known at the inlet the flow carries through the whole pipe), and what to
-inject does not depend on what is measured. The adaptivity gap is none (`docs/injection.md`).
+register_injection(PIPE_2D, "eitbench/Pipe2DInjection-v0", description=f"""{INJECTION_TEXT}
+This environment is a reference case, not a competition: no policy is better than one pair near the
+inlet, injected all the time (the flow carries the information from the inlet through the whole
+pipe), and the best injection does not depend on the data. The adaptivity gap is zero
+(`docs/injection.md`).
 """)
-register(PIPE_2D, "eitbench/Pipe2DInjectionInflow-v0", track="injection", inflow="learned",
-         about=f"""{INJECTION_ABOUT}
-Here the filter has learned from training inflows how slugs last and how wide they are
-(`docs/methods.md`, 10), and linearises about each prediction; in `eitbench/Pipe2DInjection-v0` it
-takes them for white noise, Table 5.1. With the best pair at the inlet the error is a seventh of
-what it is there, and this is as much a reference: the adaptivity gap is none (`docs/injection.md`).
+register_injection(PIPE_2D, "eitbench/Pipe2DInjectionInflow-v0", inflow="learned",
+                   description=f"""{INJECTION_TEXT}
+The filter uses a prior of duration and width of slugs that is fitted to training inflows
+(`docs/methods.md`, 10), and linearises about each prediction; in `eitbench/Pipe2DInjection-v0` its
+inflow is white noise, Table 5.1. With the best pair at the inlet the error is one seventh of the
+error there. This environment is a reference case too: the adaptivity gap is zero
+(`docs/injection.md`).
 """)
-register(PIPE_2D_CURRENTS, "eitbench/Pipe2DInjectionCurrents-v0", track="injection",
-         about=f"""{INJECTION_ABOUT}
-This is the same world with a current of its own for each electrode, and as much a reference: the
-best currents, the same at every step, take a tenth off the ẽ_c of any pairs, and the clairvoyant 2
-% more. The adaptivity gap is none.
+register_injection(PIPE_2D_CURRENTS, "eitbench/Pipe2DInjectionCurrents-v0",
+                   description=f"""{INJECTION_TEXT}
+The action is a current for each electrode. This environment is a reference case: the best currents,
+the same at every step, reduce ẽ_c by a tenth relative to pairs, and the clairvoyant policy by
+another 2 %. The adaptivity gap is zero.
 
-Actions are in parts of the instrument's 0.1 A/m. Entries beyond ±1 are first cut to ±1; then their
-mean is taken away (Σ I = 0); if they still exceed the limit, they are scaled down to it. The limit
-is the norm of a pair: Σ|I| ≤ 2 ("L1", a total current), Σ I² ≤ 2 ("L2", a power) or |I| ≤ 1
-("Linf", a source for each electrode):
-`world={{"instrument": {{"limit": "L1"}}}}`.
+Actions are relative to the instrument's 0.1 A/m. Entries are clipped to ±1; their mean is
+subtracted (Σ I = 0); if the result exceeds the norm of a pair, it is scaled down to it. The norm is
+Σ|I| ≤ 2 ("L1", a total current), Σ I² ≤ 2 ("L2", a power) or |I| ≤ 1 ("Linf", a source for each
+electrode): `world={{"instrument": {{"current_norm": "L1"}}}}`.
 """)
 
-# -- 2D pipe with an instrument that is falling apart --
+# -- 2D pipe with a faulty instrument --
 
 PIPE_2D_FAULTS = World(
     "Pipe2D", PIPE_2D.vessel, PIPE_2D.flow, PIPE_2D.target,
-    Instrument(noise_floor=1e-4, interference=0.5, dead=(2, 4), failing=(1, 2), loose=(0, 2)))
-"""A bad contact has 0.5 to 2 Ω·m more (a sound one: 0.08) and five times the noise [all ours]."""
+    Instrument(noise_floor=1e-4, interference=0.5, n_dead_range=(2, 4), n_failing_range=(1, 2),
+               n_loose_range=(0, 2)))
+"""A bad contact adds 0.5 to 2 Ω·m (an intact one has 0.08) and has five times the noise [ours]."""
 
-register(PIPE_2D_FAULTS, "eitbench/Pipe2DInjectionFaults-v0", track="injection",
-         seeds="test:0-49", gate=8.0, about="""
-`eitbench/Pipe2DInjection-v0` with an instrument that is falling apart. In every episode other
-electrodes are dead from the beginning, others fail on the way, others have a bad contact, and
-nobody announces it. A current that would have to pass a broken wire does not flow; the reading of
-such an electrode is interference, 0.5 V (std), about as much as the largest voltages. The filter
-inside leaves out readings that are further than 8 standard deviations (`gate`) from its prediction,
-and a whole injection if that is so of more than a third of its readings.
+register_injection(PIPE_2D_FAULTS, "eitbench/Pipe2DInjectionFaults-v0", test_seeds="test:0-49",
+                   gate=8.0, description="""
+`eitbench/Pipe2DInjection-v0` with a faulty instrument. In every episode other electrodes are dead
+from the beginning, fail during the episode, or have a bad contact; the task does not specify which.
+A current through a broken wire does not flow, and the measurement at such an electrode is
+interference, 0.5 V (std), about as much as the largest voltages. The filter inside rejects
+measurements that differ by more than 8 standard deviations (`gate`) from its prediction, and a
+whole injection if it rejects more than a third of its measurements.
 
-Which pair is best depends on the episode, and the measurements tell (`doubt` and `innovations` show
-what is broken): the adaptivity gap is 0.52, with a 95 % interval from 0.28 to 0.82 over the
-board's 50 episodes (`docs/injection.md`).
+The best pair depends on the episode, and the measurements indicate it (`doubt` and `innovations`
+show the broken electrodes): the adaptivity gap is 0.52, with a 95 % interval from 0.28 to 0.82 over
+the 50 episodes of the leaderboard (`docs/injection.md`).
 """)
 
-# -- 2D pipe when slugs are rare --
+# -- 2D pipe with rare slugs --
 
 PIPE_2D_INTERMITTENT = World(
     "Pipe2DIntermittent", PlanePipe(), LaminarFlow(),
-    Slugs(strength=(0.35, 0.60), arrivals=NowAndThen(interval=0.10, wait=0.20)),
+    Slugs(log_amplitude=(0.35, 0.60),
+          arrivals=DeadTimePoissonArrivals(dead_time=0.10, mean_wait=0.20)),
     schedule=Schedule(scored_steps=180))
-"""Strong slugs, about three in the injections that are scored; all numbers are ours."""
+"""Strong slugs, about three in the scored injections; all numbers [ours]."""
 PIPE_2D_BUDGET = replace(PIPE_2D_INTERMITTENT,
                          schedule=replace(PIPE_2D_INTERMITTENT.schedule, budget=30))
-"""The same episodes, in which an agent may inject at one step in six only."""
+"""The same episodes; the agent may inject in one step of six."""
 
-register(PIPE_2D_INTERMITTENT, "eitbench/Pipe2DIntermittent-v0", seeds="test:0-15", about="""
-The pipe of `eitbench/Pipe2D-v0` when slugs are rare: strong ones come one at a time, at times
-nobody foresees, about three in an episode. Between them what flows in does not change. A Gaussian
-prior of the inflow has to believe in a little of a slug at every moment; who asks whether a slug
-has come at all can be sure of the quiet, and wide awake when it ends. The episodes are those of
+register_extension(PIPE_2D_INTERMITTENT, "eitbench/Pipe2DIntermittent-v0", test_seeds="test:0-15",
+                   description="""
+The pipe of `eitbench/Pipe2D-v0` with rare slugs: strong slugs come one at a time, at random times,
+about three in an episode. Between them the inflow is constant. A Gaussian prior of the inflow
+assigns a moderate variance to every step; a method that detects slugs can use a small variance
+between them and a large one during a slug. The episodes are those of
 `eitbench/Pipe2DInjectionBudget-v0`, with an injection at every step.
 """)
-register(PIPE_2D_BUDGET, "eitbench/Pipe2DInjectionInflowBudget-v0", track="injection",
-         seeds="test:0-49", inflow="learned", about="""
+register_injection(PIPE_2D_BUDGET, "eitbench/Pipe2DInjectionInflowBudget-v0",
+                   test_seeds="test:0-49", inflow="learned", description="""
 The rare slugs and the budget of `eitbench/Pipe2DInjectionBudget-v0`, with the filter of
-`eitbench/Pipe2DInjectionInflow-v0`, which has learned from training inflows what flows in. On the
+`eitbench/Pipe2DInjectionInflow-v0`, whose inflow prior is fitted to training inflows. On the
 episodes dev:0-7 the adaptivity gap is 0.45, with a 95 % interval from 0.34 to 0.62
 (`docs/injection.md`).
 """)
-register(PIPE_2D_BUDGET, "eitbench/Pipe2DInjectionBudget-v0", track="injection",
-         seeds="test:0-49", about="""
-The pipe of `eitbench/Pipe2D-v0` when slugs are rare: strong ones come one at a time, at times
-nobody foresees, about three in an episode. The agent may inject at one step in six only, so it has
-to notice that a slug has come and then look closely, and to keep something for the next one. Once
-the budget is spent every action is no injection (`action_masks`); within it injections cost
-nothing. Where nothing is injected `voltages` are the amplifiers' noise (here none) and
-`innovations` zero. The first frame does not count against the budget.
+register_injection(PIPE_2D_BUDGET, "eitbench/Pipe2DInjectionBudget-v0", test_seeds="test:0-49",
+                   is_starting_point=True, description="""
+The pipe of `eitbench/Pipe2D-v0` with rare slugs: strong slugs come one at a time, at random times,
+about three in an episode. The agent may inject in one step of six, so it has to detect a slug, then
+inject often, and save injections for the next one. When the budget is spent, every action is no
+injection (`action_masks`); injections within the budget cost nothing. In a step without injection
+`voltages` are the amplifiers' noise (zero here) and `innovations` are zero. The first frame does
+not count against the budget.
 
-The adaptivity gap is 0.51, with a 95 % interval from 0.45 to 0.57 over the board's 50 episodes
-(`docs/injection.md`).
+The adaptivity gap is 0.51, with a 95 % interval from 0.45 to 0.57 over the 50 episodes of the
+leaderboard (`docs/injection.md`).
 """)
 
-# -- 2D pipe with a mean velocity that wanders --
+# -- 2D pipe with a mean velocity that drifts --
 
-PIPE_2D_DRIFTING = World("Pipe2DDriftingVelocity", PlanePipe(), WanderingFlow(), Slugs(),
+PIPE_2D_DRIFTING = World("Pipe2DDriftingVelocity", PlanePipe(), RandomWalkFlow(), Slugs(),
                          region=(0.28, 0.40))
-"""Errors are counted between two cross-sections; all numbers are ours."""
+"""Errors are integrated between two cross-sections; all numbers [ours]."""
 
-register(PIPE_2D_DRIFTING, "eitbench/Pipe2DInjectionFlow-v0", track="injection",
-         seeds="test:0-29", about="""
-The pipe of `eitbench/Pipe2D-v0` with a mean velocity that nobody knows and that drifts, a random
-walk between 2.5 and 6.5 m/s. Only what flows through a region of interest counts, by default the
-last 12 cm (`world={"region": null}`: the whole pipe). The filter inside estimates concentration and
-mean velocity together (the joint extended Kalman filter of the thesis' chapter 6), from 4.5 ± 1
-m/s. Slugs may be looked at when they enter, on the way or when they arrive; what is known of one
-that has entered is worth no more than what is known of the flow that carries it.
+register_injection(PIPE_2D_DRIFTING, "eitbench/Pipe2DInjectionFlow-v0", test_seeds="test:0-29",
+                   description="""
+The pipe of `eitbench/Pipe2D-v0` with an unknown mean velocity that drifts, a random walk between
+2.5 and 6.5 m/s. Errors are integrated over a region of interest, by default the last 12 cm
+(`world={"region": null}`: the whole pipe). The filter inside estimates concentration and mean
+velocity together (the joint extended Kalman filter of the thesis' chapter 6), from 4.5 ± 1 m/s. The
+agent may observe slugs at the inlet, on their way or in the region; the position of a slug that has
+entered is as uncertain as the velocity that carries it.
 
-This is a competition case: the adaptivity gap is 1.04, with a 95 % interval from 0.70 to 1.96 over
-the board's 30 episodes. No hand-written policy that looks at the data has beaten random pairs,
-which are as good as the best cycle; trained agents do (`docs/injection.md`).
+This environment is a competition: the adaptivity gap is 1.04, with a 95 % interval from 0.70 to
+1.96 over the 30 episodes of the leaderboard. No hand-written adaptive policy outperforms random
+pairs, which are as good as the best cycle; trained agents do (`docs/injection.md`).
 """)
 
-# -- The stirred tank in which an agent chooses what to inject --
+# -- Stirred tank in which an agent injects --
 
-register(ROTATING_TANK_2D, "eitbench/RotatingTankInjection-v0", track="injection", about="""
-The stirred tank of `eitbench/RotatingTank2D-v0`: a ball that hardly conducts is carried round on a
-path that nobody knows beforehand. Here the agent chooses which pair of electrodes injects. The
-filter inside knows the liquid's flow and of no ball. The first frame is one injection of 0 → 8.
+register_injection(ROTATING_TANK_2D, "eitbench/RotatingTankInjection-v0", description="""
+The stirred tank of `eitbench/RotatingTank2D-v0`: the flow carries a ball with a low conductivity on
+an unknown path, and the agent chooses the pair of electrodes that injects. The filter inside has
+the flow of the liquid and no model of the ball. The first frame is one injection of 0 → 8.
 
-This is a reference case, not a competition: the liquid carries the ball past every pair, between
-random pairs and the clairvoyant there are 8 % of ẽ_c, and no policy that looks at the data has
-beaten the best pair. The adaptivity gap is 0.25, with a 95 % interval from 0.05 to 0.40 over the
-board's 10 episodes, a quotient of small numbers (`docs/injection.md`).
+This environment is a reference case, not a competition: the liquid carries the ball past every
+pair, the clairvoyant policy improves ẽ_c by 8 % over random pairs, and no adaptive policy
+outperforms the best pair. The adaptivity gap is 0.25, with a 95 % interval from 0.05 to 0.40 over
+the 10 episodes of the leaderboard, a quotient of small numbers (`docs/injection.md`).
 """)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from eitbench import _check
 
-LATER = {"later": True}
+ADDED_LATER = {"later": True}
 """Metadata of a number that a part was given later: at its default it is left out of the names
 under which things are kept, so that what was kept before it came is still found."""
 

@@ -12,10 +12,10 @@ import numpy as np
 
 from eitbench import _check
 from eitbench.physics.flow import PlaneChannelFlow, PlugFlow, PowerLawFlow
-from eitbench.physics.profiles import SkewedChannelFlow, VelocityModel, parabola
+from eitbench.physics.profiles import SkewedChannelFlow, VelocityModel, parabolic_model
 from eitbench.worlds.fields import check_positive, check_range
 from eitbench.worlds.vessels import Bulge, PlanePipe
-from eitbench.worlds.world import Discretisation, Flow, World, refuse_assumptions
+from eitbench.worlds.world import Discretisation, Flow, World, reject_unknown_assumptions
 
 if TYPE_CHECKING:
     from eitbench.physics.navier_stokes import SteadyFlow
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 PROFILES = ("parabolic", "plug", "power-law")
 """Shapes of the velocity profile that a model of a plane pipe may assume."""
-BELIEVED_PAST_A_BULGE = ("parabolic", "real")
+BULGE_FLOW_ASSUMPTIONS = ("parabolic", "real")
 """What a model of the flow past a bulge may assume."""
 
 
@@ -40,15 +40,15 @@ class PipeFlow(Flow):
         check_positive(self, mean_velocity="m/s", diffusivity="m²/s")
 
     def nominal(self, world: World, fine: bool) -> VelocityField:
-        return world.vessel.laminar(self.mean_velocity)
+        return world.vessel.laminar_velocity(self.mean_velocity)
 
     def check_assumed(self, world: World, assumed: Mapping[str, Any]) -> None:
-        self.believed(world, **assumed)
+        self.assumed_velocity(world, **assumed)
 
-    def believed(self, world: World, **assumed: Any) -> VelocityField:
+    def assumed_velocity(self, world: World, **assumed: Any) -> VelocityField:
         """``mean_velocity`` in m/s, and in a plane pipe ``profile``, one of `PROFILES`."""
         plane = isinstance(world.vessel, PlanePipe)
-        refuse_assumptions(assumed, ("mean_velocity", "profile") if plane else ("mean_velocity",))
+        reject_unknown_assumptions(assumed, ("mean_velocity", "profile")[:1 + plane])
         mean = assumed.get("mean_velocity")
         mean = _check.number("assume.mean_velocity", self.mean_velocity if mean is None else mean,
                              low=0.0, units="m/s")
@@ -60,11 +60,11 @@ class PipeFlow(Flow):
             return PlugFlow(mean)
         if profile == "power-law":
             return PowerLawFlow(mean, world.vessel.half_width)
-        laminar: VelocityField = world.vessel.laminar(mean)
+        laminar: VelocityField = world.vessel.laminar_velocity(mean)
         return laminar
 
-    def flush_steps(self, world: World) -> int:
-        return steps_through(world, self.mean_velocity)
+    def residence_steps(self, world: World) -> int:
+        return transit_steps(world, self.mean_velocity)
 
 
 @dataclass(frozen=True)
@@ -73,7 +73,7 @@ class LaminarFlow(PipeFlow):
 
 
 @dataclass(frozen=True)
-class DrawnFlow(PipeFlow):
+class RandomFlow(PipeFlow):
     """A flow through a plane pipe that is drawn for each episode (thesis 5.1.2 and ch. 6).
 
     v̄(t) = mean·(1 + swing·sin(2πt/period + phase)), its profile (1 − η²)·exp(kη). Estimators are
@@ -82,7 +82,7 @@ class DrawnFlow(PipeFlow):
 
     velocity_range: tuple[float, float] = (2.5, 7.0)
     """m/s, of the true mean, drawn evenly; the thesis assumes 2 and 7 for a true 4.5 [ours]"""
-    swing_range: tuple[float, float] = (0.0, 0.0)
+    oscillation_range: tuple[float, float] = (0.0, 0.0)
     """amplitude of the mean velocity's sine in time, in parts of the mean"""
     period_range: tuple[float, float] = (0.4, 0.8)
     """s, period of that sine"""
@@ -98,26 +98,27 @@ class DrawnFlow(PipeFlow):
     def __post_init__(self) -> None:
         super().__post_init__()
         check_range(self, "velocity_range", "m/s")
-        check_range(self, "swing_range", open_low=False)
+        check_range(self, "oscillation_range", open_low=False)
         check_range(self, "period_range", "s")
         check_range(self, "skewness_range", open_low=False)
-        if self.swing_range[1] >= 1 or self.skewness_range[1] > 5:
-            raise ValueError("swing_range must lie below 1 and skewness_range below 5, got "
-                             f"{self.swing_range!r} and {self.skewness_range!r}")
+        if self.oscillation_range[1] >= 1 or self.skewness_range[1] > 5:
+            raise ValueError("oscillation_range must lie below 1 and skewness_range below 5, got "
+                             f"{self.oscillation_range!r} and {self.skewness_range!r}")
         if self.profiles not in (None, "mean", "three"):
             raise ValueError(f"profiles must be None, 'mean' or 'three', got {self.profiles!r}")
         _check.number("velocity_std", self.velocity_std, low=0.0, units="m/s")
         _check.number("velocity_walk", self.velocity_walk, low=0.0, units="m/s")
 
-    def lead_in(self, world: World) -> int:
-        return steps_through(world, self.velocity_range[0] * (1.0 - self.swing_range[1]))
+    def spin_up_steps(self, world: World) -> int:
+        return transit_steps(world, self.velocity_range[0] * (1.0 - self.oscillation_range[1]))
 
     def velocity_model(self, world: World) -> VelocityModel | None:
         half_width = world.vessel.half_width
         if self.profiles is None:
             return None
         if self.profiles == "mean":
-            return parabola(half_width, self.mean_velocity, self.velocity_std, self.velocity_walk)
+            return parabolic_model(half_width, self.mean_velocity, self.velocity_std,
+                                   self.velocity_walk)
         # the parabola, a skew cubic, and a quartic without a net flux that flattens or sharpens it
         basis = ((1.5, 0.0, -1.5), (0.0, 1.5, 0.0, -1.5), (-1.5, 0.0, 9.0, 0.0, -7.5))
         nominal = (self.mean_velocity, 0.0, 0.0)
@@ -126,7 +127,7 @@ class DrawnFlow(PipeFlow):
 
     def draw(self, world: World, random: np.random.Generator) -> Callable[[int], SkewedChannelFlow]:
         mean = random.uniform(*self.velocity_range)
-        swing = random.uniform(*self.swing_range)
+        swing = random.uniform(*self.oscillation_range)
         period = random.uniform(*self.period_range)
         phase = random.uniform(0.0, 2.0 * math.pi)
         skewness = random.choice([-1.0, 1.0]) * random.uniform(*self.skewness_range)
@@ -140,7 +141,7 @@ class DrawnFlow(PipeFlow):
 
 
 @dataclass(frozen=True)
-class WanderingFlow(PipeFlow):
+class RandomWalkFlow(PipeFlow):
     """A parabolic flow in a plane pipe whose mean velocity is a random walk; numbers are ours.
 
     At every time step it goes up or down by ``velocity_walk``, which is also the walk that
@@ -160,25 +161,25 @@ class WanderingFlow(PipeFlow):
         _check.number("velocity_std", self.velocity_std, low=0.0, units="m/s")
         check_range(self, "velocity_range", "m/s")
 
-    def lead_in(self, world: World) -> int:
-        return steps_through(world, self.velocity_range[0])
+    def spin_up_steps(self, world: World) -> int:
+        return transit_steps(world, self.velocity_range[0])
 
     def velocity_model(self, world: World) -> VelocityModel:
-        return parabola(world.vessel.half_width, self.mean_velocity, self.velocity_std,
+        return parabolic_model(world.vessel.half_width, self.mean_velocity, self.velocity_std,
                         self.velocity_walk)
 
     def draw(self, world: World, random: np.random.Generator) -> Callable[[int], SkewedChannelFlow]:
         low, high = self.velocity_range
         places = int((high - low) / self.velocity_walk + 1e-9)  # from the lowest to the highest
         walk = random.integers(2 * places) if places else 0
-        signs = random.choice([-1, 1], world.lead_in + world.n_steps)
+        signs = random.choice([-1, 1], world.spin_up_steps + world.n_steps)
         steps = walk + np.concatenate([[0], np.cumsum(signs)])[:-1]
         # turned back at the ends
         folded = np.abs((steps + places) % (2 * places) - places) if places else 0 * steps
         velocity = low + folded * self.velocity_walk
 
         def flow(t: int) -> SkewedChannelFlow:
-            mean = float(velocity[t + world.lead_in - 1])
+            mean = float(velocity[t + world.spin_up_steps - 1])
             return SkewedChannelFlow(mean, world.vessel.half_width)
 
         return flow
@@ -205,13 +206,13 @@ class FlowPastBulge(PipeFlow):
         return _past_bulge(world.vessel, self, (96, 24) if fine else (64, 16))
 
     def check_assumed(self, world: World, assumed: Mapping[str, Any]) -> None:
-        """``flow``, one of `BELIEVED_PAST_A_BULGE`."""
-        refuse_assumptions(assumed, ("flow",))
-        if (flow := assumed.get("flow", "parabolic")) not in BELIEVED_PAST_A_BULGE:
-            known = ", ".join(BELIEVED_PAST_A_BULGE)
+        """``flow``, one of `BULGE_FLOW_ASSUMPTIONS`."""
+        reject_unknown_assumptions(assumed, ("flow",))
+        if (flow := assumed.get("flow", "parabolic")) not in BULGE_FLOW_ASSUMPTIONS:
+            known = ", ".join(BULGE_FLOW_ASSUMPTIONS)
             raise ValueError(f"assume.flow must be one of {known}, got {flow!r}")
 
-    def believed(self, world: World, **assumed: Any) -> VelocityField:
+    def assumed_velocity(self, world: World, **assumed: Any) -> VelocityField:
         """By default what those believe who know the walls only."""
         self.check_assumed(world, assumed)
         if assumed.get("flow") == "real":
@@ -290,7 +291,7 @@ class LocalParabola:
         return np.stack([by_eta * 2.0 / gap, by_eta * 2.0 * slope / gap * (1.0 - part)], axis=1)
 
 
-def steps_through(world: World, velocity: float) -> int:
+def transit_steps(world: World, velocity: float) -> int:
     """Time steps in which a fluid of this velocity in m/s passes through a pipe."""
     return math.ceil(world.vessel.length / (velocity * world.time_step))
 
@@ -298,7 +299,7 @@ def steps_through(world: World, velocity: float) -> int:
 @lru_cache(maxsize=1)
 def _real_model(world: World) -> Discretisation:
     """Made once a process, since a filter keeps with a transport model what it derives from it."""
-    return world.model(flow="real")
+    return world.estimator_model(flow="real")
 
 
 @lru_cache(maxsize=4)
@@ -312,13 +313,14 @@ def _past_bulge(vessel: PlanePipe, flow: FlowPastBulge, cells: tuple[int, int]) 
                               np.linspace(-R, R, cells[1] + 1))
     inlet = straight.facets_where(lambda p: p[:, 0] == 0.0)
     walls = straight.facets_where(lambda p: np.abs(p[:, 1]) == R)
-    return steady_flow(vessel.shaped(straight), flow.viscosity,
-                       [(inlet, vessel.laminar(flow.mean_velocity)), (walls, np.zeros_like)])
+    parabola = vessel.laminar_velocity(flow.mean_velocity)
+    return steady_flow(vessel.deform(straight), flow.viscosity,
+                       [(inlet, parabola), (walls, np.zeros_like)])
 
 
 @lru_cache(maxsize=4)
 def _stirred(flow: StirredFlow, radius: float, rings: int) -> SteadyFlow:
-    from eitbench.numerics.round import uniform_disc
+    from eitbench.numerics.round_meshes import uniform_disc
     from eitbench.physics.navier_stokes import steady_flow
     mesh = uniform_disc(radius, rings)
 

@@ -9,16 +9,16 @@ import numpy as np
 
 from eitbench import _check
 from eitbench.physics.observation import VoltageNoise
-from eitbench.worlds.fields import LATER, check_positive, check_range
+from eitbench.worlds.fields import ADDED_LATER, check_positive, check_range
 
-LIMITS = ("L1", "L2", "Linf")
+CURRENT_NORMS = ("L1", "L2", "Linf")
 """Norms that may bound the currents."""
 
 
 class Faults(NamedTuple):
     """What is wrong in one episode; nobody announces it."""
 
-    broken_from: np.ndarray
+    open_circuit_from: np.ndarray
     """(L,) first t at which an electrode's wire is broken; never, if beyond the episode's end"""
     resistance: np.ndarray
     """(L,) Ω (Ω·m in 2D) between the instrument and the electrode"""
@@ -47,19 +47,19 @@ class Instrument:
     """A (A/m in 2D); with relative noise the amplitude does not matter [ours]"""
     noise_relative: float = 0.01
     """std in parts of the reading [T]"""
-    noise_of_largest: float = 0.001
+    noise_relative_to_max: float = 0.001
     """std in parts of the largest voltage [T]"""
     noise_floor: float = 0.0
     """V; std of an absolute noise beside the relative one"""
-    limit: str | None = None
+    current_norm: str | None = None
     """what an agent may ask for. None: pairs of electrodes. "L1", "L2" or "Linf": a current for
     each electrode, cut to ±1 in parts of `current`, freed of its mean, and scaled down to this norm
     of a pair's currents where it exceeds it"""
-    dead: tuple[int, int] = (0, 0)
+    n_dead_range: tuple[int, int] = (0, 0)
     """least and most electrodes whose wire is broken from the beginning"""
-    failing: tuple[int, int] = (0, 0)
+    n_failing_range: tuple[int, int] = (0, 0)
     """least and most electrodes whose wire breaks on the way"""
-    loose: tuple[int, int] = (0, 0)
+    n_loose_range: tuple[int, int] = (0, 0)
     """least and most electrodes with a bad contact"""
     loose_resistance: tuple[float, float] = (0.5, 2.0)
     """Ω (Ω·m in 2D); a sound contact of the 2D pipe has 0.08"""
@@ -67,23 +67,24 @@ class Instrument:
     """factor of a bad contact's noise"""
     interference: float = 0.1
     """V; std of what a broken wire reads"""
-    untold_noise: float = field(default=1.0, metadata=LATER)
+    noise_mismatch: float = field(default=1.0, metadata=ADDED_LATER)
     """factor by which the noise of all readings exceeds what estimators are told"""
-    contact_spread: float = field(default=0.0, metadata=LATER)
+    contact_impedance_spread: float = field(default=0.0, metadata=ADDED_LATER)
     """how far each electrode's contact impedance may be from what estimators are told, in parts of
     it; drawn evenly, anew for each episode"""
 
     def __post_init__(self) -> None:
         check_positive(self, current="A")
-        for name, units in (("noise_relative", ""), ("noise_of_largest", ""), ("noise_floor", "V"),
-                            ("interference", "V")):
+        for name, units in (("noise_relative", ""), ("noise_relative_to_max", ""),
+                            ("noise_floor", "V"), ("interference", "V")):
             _check.number(name, getattr(self, name), low=0.0, units=units)
-        if self.limit is not None and self.limit not in LIMITS:
-            raise ValueError(f"limit must be one of {', '.join(LIMITS)}, got {self.limit!r}")
+        if self.current_norm is not None and self.current_norm not in CURRENT_NORMS:
+            raise ValueError(f"current_norm must be one of {', '.join(CURRENT_NORMS)}, "
+                             f"got {self.current_norm!r}")
         _check.number("loose_noise", self.loose_noise, low=1.0)
-        _check.number("untold_noise", self.untold_noise, low=0.0)
-        _check.number("contact_spread", self.contact_spread, low=0.0, high=0.95)
-        for name in ("dead", "failing", "loose"):
+        _check.number("noise_mismatch", self.noise_mismatch, low=0.0)
+        _check.number("contact_impedance_spread", self.contact_impedance_spread, low=0.0, high=0.95)
+        for name in ("n_dead_range", "n_failing_range", "n_loose_range"):
             bounds = getattr(self, name)
             if not isinstance(bounds, (tuple, list)) or len(bounds) != 2:
                 raise ValueError(f"{name} must be a range (least, most), got {bounds!r}")
@@ -93,24 +94,24 @@ class Instrument:
         check_range(self, "loose_resistance", "Ω", open_low=False)
 
     @property
-    def most(self) -> int:
+    def max_faulty(self) -> int:
         """The most electrodes that have a fault."""
-        return self.dead[1] + self.failing[1] + self.loose[1]
+        return self.n_dead_range[1] + self.n_failing_range[1] + self.n_loose_range[1]
 
     @property
     def noise(self) -> VoltageNoise:
         """What estimators take for that of a sound electrode's reading, without the floor."""
-        return VoltageNoise(self.noise_relative, self.noise_of_largest)
+        return VoltageNoise(self.noise_relative, self.noise_relative_to_max)
 
     @property
-    def believed_noise(self) -> VoltageNoise:
+    def model_noise(self) -> VoltageNoise:
         """What estimators take for the noise of a reading: with the floor, of faults nothing."""
-        return VoltageNoise(self.noise_relative, self.noise_of_largest, self.noise_floor)
+        return VoltageNoise(self.noise_relative, self.noise_relative_to_max, self.noise_floor)
 
     def draw(self, random: np.random.Generator, n_electrodes: int, n_steps: int) -> Faults:
         """The faults of one episode: which electrodes, and when in t = 1 … n_steps wires break."""
         order = random.permutation(n_electrodes)
-        ranges = (self.dead, self.failing, self.loose)
+        ranges = (self.n_dead_range, self.n_failing_range, self.n_loose_range)
         dead, failing, loose = (int(random.integers(low, high + 1)) for low, high in ranges)
         broken = np.full(n_electrodes, n_steps + 1)
         broken[order[:dead]] = 0
@@ -124,7 +125,8 @@ class Instrument:
 
     def draw_contacts(self, random: np.random.Generator, n_electrodes: int) -> np.ndarray:
         """(L,) of one episode: contact impedances in parts of what estimators are told."""
-        return random.uniform(1.0 - self.contact_spread, 1.0 + self.contact_spread, n_electrodes)
+        spread = self.contact_impedance_spread
+        return random.uniform(1.0 - spread, 1.0 + spread, n_electrodes)
 
     def measure(self, faults: Faults, t: np.ndarray | int, transfer_resistance: np.ndarray,
                 currents: np.ndarray, draws: np.ndarray) -> np.ndarray:
@@ -138,10 +140,10 @@ class Instrument:
         transfer_resistance, currents, draws : (B, L, L), (B, L), (B, L)
             𝓡, the currents asked for in A (A/m in 2D), and standard normal numbers.
         """
-        broken = np.asarray(t)[..., None] >= faults.broken_from
+        broken = np.asarray(t)[..., None] >= faults.open_circuit_from
         flows = ~(broken & (currents != 0.0)).any(axis=1, keepdims=True)
         driven = currents * flows
         clean = (transfer_resistance @ driven[..., None])[..., 0] + faults.resistance * driven
         told = np.hypot(self.noise.std(clean) * faults.noise_factor, self.noise_floor)
-        std = self.untold_noise * told
+        std = self.noise_mismatch * told
         return np.where(broken, self.interference * draws, clean + std * draws)

@@ -1,4 +1,4 @@
-"""The worlds that can be played, by ids: ours, those of installed packages, those of a script."""
+"""Registry of environments: built-in ids, those of installed packages, and those of a script."""
 
 from __future__ import annotations
 
@@ -13,23 +13,28 @@ from typing import Any
 import gymnasium as gym
 
 from eitbench import _check
+from eitbench.worlds.stored_names import warn_renamed
 from eitbench.worlds.world import World
 
-GROUP = "eitbench.worlds"
+WORLDS_GROUP = "eitbench.worlds"
 """Entry points of installed packages: modules that call `register` when they are imported."""
-CLASSES = {
+ENV_CLASSES = {
     "estimation": ("eitbench.envs.estimation:EstimationEnv",
                    "eitbench.envs.estimation:EstimationVectorEnv"),
     "injection": ("eitbench.envs.injection:InjectionEnv",
                   "eitbench.envs.injection:InjectionVectorEnv")}
-"""Track -> its environment, one at a time and vectorised."""
-SETTINGS = {"estimation": ("lag", "assume"), "injection": ("gate", "inflow")}
-"""Track -> what an id may fix of its environment, beside the world."""
+"""Track -> its environment and its vector environment."""
+ID_SETTINGS = {"estimation": ("lag", "assume"), "injection": ("gate", "inflow")}
+"""Track -> arguments of its environment that an id may fix, besides the world."""
+GROUPS = ("thesis examples", "extensions", "robustness variants", "injection", "user-defined")
+"""Groups of ids in lists of environments."""
+EARLIER_KEYWORDS = {"about": "description", "seeds": "test_seeds", "home": "nominal"}
+"""Earlier keyword of `register` -> its keyword."""
 
 
 @dataclass(frozen=True)
 class Entry:
-    """A registered id: which world is played, and what is asked."""
+    """A registered id: its world and its task."""
 
     id: str
     """``namespace/Name-vN``"""
@@ -37,129 +42,162 @@ class Entry:
     track: str
     """estimation or injection"""
     settings: Mapping[str, Any] = field(default_factory=dict)
-    """of the environment, JSON-ready; one of `SETTINGS`"""
-    about: str = ""
-    """Markdown: what the page of the environment says first"""
-    seeds: str = "test:0-9"
-    """the episodes of its board"""
-    home: str = ""
-    """the id whose task estimators get here too, though the truth is another; empty: its own"""
+    """of the environment, JSON-ready; keys from `ID_SETTINGS`"""
+    description: str = ""
+    """Markdown at the beginning of the environment's page"""
+    test_seeds: str = "test:0-9"
+    """episodes of its leaderboard"""
+    nominal: str = ""
+    """id of the nominal environment if this one is shifted: same task, other ground truth"""
+    group: str = "user-defined"
+    """one of `GROUPS`"""
+    is_starting_point: bool = False
+    """whether new users should begin with this environment"""
+
+    @property
+    def variant(self) -> str:
+        """Name of a shifted environment among the variants of its nominal one."""
+        name, nominal = (id.split("/")[-1].rpartition("-v")[0] for id in (self.id, self.nominal))
+        words = re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "-", name.removeprefix(nominal))
+        return words.lower() if nominal else ""
 
 
 _entries: dict[str, Entry] = {}
-_by_hand: set[str] = set()
-"""Ids that neither we nor an installed package registered: other processes must be told of them."""
+_runtime_ids: set[str] = set()
+"""Ids that a script registered, not this or an installed package: other processes need them."""
 
 
-def register(world: World, id: str, *, track: str = "estimation", about: str = "",
-             seeds: str = "test:0-9", home: str = "", **settings: Any) -> None:
-    """Make a world playable under an id, for `gymnasium.make` and for everything here.
-
-    ``ValueError`` if the id has another form or belongs to another world, a setting is unknown, or
-    estimators are told something else than at ``home``.
+def register(world: World, id: str, *, track: str = "estimation", description: str = "",
+             test_seeds: str = "test:0-9", nominal: str = "", group: str = "user-defined",
+             is_starting_point: bool = False, **settings: Any) -> None:
+    """Register a world under an id, for `gymnasium.make` and for runs.
 
     Parameters
     ----------
     world : World
     id : str
-        ``namespace/Name-vN``. Other numbers are another version.
+        ``namespace/Name-vN``. A world with other numbers needs another version.
     track : "estimation" or "injection"
-        Whether the agent says what the concentration is, or what to inject next.
-    about : str
-        Markdown, for the environment's page.
-    seeds : str
-        The test episodes of its board.
-    home : str
-        Of a shift: the registered id whose task estimators get here too, though the truth is
-        another. The robustness board compares the two, and quotes the first paragraph of ``about``.
+        Whether actions are estimates of the concentration or the next injection.
+    description : str
+        Markdown for the environment's page.
+    test_seeds : str
+        Test episodes of its leaderboard.
+    nominal : str
+        For a shifted environment: the registered id with the same task and another ground truth.
+        The robustness table compares the two and quotes the first paragraph of ``description``.
+    group : str
+        One of `GROUPS`, for lists of environments.
+    is_starting_point : bool
+        Whether lists recommend this environment to new users.
     settings
-        Of the environment: ``lag`` and ``assume`` for estimates, ``gate`` and ``inflow`` for
-        injections.
+        ``lag`` and ``assume`` of estimation, ``gate`` and ``inflow`` of injection.
+
+    Raises
+    ------
+    ValueError
+        If the id has another form or belongs to another world, a setting is unknown, or the task
+        differs from that of ``nominal``.
     """
+    texts = {"description": description, "test_seeds": test_seeds, "nominal": nominal}
+    for old in EARLIER_KEYWORDS.keys() & settings:
+        warn_renamed(old, EARLIER_KEYWORDS[old])
+        texts[EARLIER_KEYWORDS[old]] = settings.pop(old)
     if not re.fullmatch(r"[\w.-]+/[\w.-]+-v\d+", id):
         raise ValueError(f"id must look like 'namespace/Name-v0', got {id!r}")
-    if track not in CLASSES:
-        raise ValueError(f"track must be one of {', '.join(CLASSES)}, got {track!r}")
-    if unknown := sorted(set(settings) - set(SETTINGS[track])):
+    if track not in ENV_CLASSES:
+        raise ValueError(f"track must be one of {', '.join(ENV_CLASSES)}, got {track!r}")
+    if group not in GROUPS:
+        raise ValueError(f"group must be one of {', '.join(GROUPS)}, got {group!r}")
+    if unknown := sorted(set(settings) - set(ID_SETTINGS[track])):
         raise ValueError(f"settings of the track {track} must be among "
-                         f"{', '.join(SETTINGS[track])}; got {', '.join(unknown)}")
+                         f"{', '.join(ID_SETTINGS[track])}; got {', '.join(unknown)}")
     try:
         json.dumps(settings, allow_nan=False)
     except (TypeError, ValueError) as error:
         raise ValueError(f"settings must be fit for JSON: {error}") from None
-    entry = Entry(id, world, track, settings, about, seeds, home)
-    if home:
-        _check_home(entry)
+    entry = Entry(id, world, track, settings, **texts, group=group,
+                  is_starting_point=is_starting_point)
+    if entry.nominal:
+        _check_same_task(entry)
     taken = _entries[id] != entry if id in _entries else id in gym.registry
     if taken:
         raise ValueError(f"id {id} belongs to another world already; take another name or version")
-    _entries[id] = entry
-    _by_hand.add(id)
-    _make_known(entry)
+    _add(entry)
 
 
-def _check_home(shifted: Entry) -> None:
-    """``ValueError`` unless estimators are told of this world what they are told at its home."""
-    home = _entries.get(shifted.home)
-    if home is None or home.home:
-        raise ValueError("home must be a registered id that is no shift itself, "
-                         f"got {shifted.home!r}")
-    here, there = _told(shifted), _told(home)
-    if other := [name for name in here if here[name] != there[name]]:
-        raise ValueError(f"home must be an id of which estimators are told the same; {shifted.id} "
-                         f"and {home.id} differ in {', '.join(other)}")
+def _check_same_task(shifted: Entry) -> None:
+    """Raise ``ValueError`` unless a shifted environment has the task of its nominal one."""
+    nominal = _entries.get(shifted.nominal)
+    if nominal is None or nominal.nominal:
+        raise ValueError("nominal must be a registered id that is not shifted itself, "
+                         f"got {shifted.nominal!r}")
+    own, expected = _task_values(shifted), _task_values(nominal)
+    if different := [name for name in own if own[name] != expected[name]]:
+        raise ValueError(f"nominal must be an id with the same task; {shifted.id} and {nominal.id} "
+                         f"differ in {', '.join(different)}")
 
 
-def _told(entry: Entry) -> dict[str, Any]:
-    """Numbers that estimators are told; beside them what is believed of the flow."""
+def _task_values(entry: Entry) -> dict[str, Any]:
+    """Return the values that the task specifies, without the assumed flow."""
     world = entry.world
     return {"track": entry.track, "settings": dict(entry.settings), "vessel": world.vessel,
             "schedule": world.schedule, "steps": (world.n_steps, world.warm_up),
-            "noise": world.instrument.believed_noise, "current": world.instrument.current,
+            "noise": world.instrument.model_noise, "current": world.instrument.current,
             "prior": world.prior}
 
 
-def _make_known(entry: Entry) -> None:
-    """To `gymnasium.make`."""
+def _add(entry: Entry) -> None:
+    """Add an entry, here and to `gymnasium.make`."""
+    _entries[entry.id] = entry
+    _runtime_ids.add(entry.id)
     if entry.id not in gym.registry:
-        single, many = CLASSES[entry.track]
-        gym.register(entry.id, entry_point=single, vector_entry_point=many,
+        single, vector = ENV_CLASSES[entry.track]
+        gym.register(entry.id, entry_point=single, vector_entry_point=vector,
                      kwargs={"name": entry.id})
 
 
 def entries() -> dict[str, Entry]:
-    """All of them by id, in the order in which they were registered."""
+    """Return all entries by id, in the order of registration."""
     return dict(_entries)
 
 
-def entry(id: str) -> Entry:
-    """The entry of this id; ``ValueError`` naming all, if there is none."""
+def entry(id: str, variant: str | None = None) -> Entry:
+    """Return the entry of an id, or of the id's ``variant``; ``ValueError`` if it is unknown."""
     if id not in _entries:
         raise ValueError(f"env must be one of {', '.join(_entries)}; got {id!r}"
                          + _check.nearest(id, _entries))
-    return _entries[id]
+    if variant is None:
+        return _entries[id]
+    variants: dict[str, Entry] = {}
+    for each in _entries.values():
+        if each.nominal == id:
+            variants.setdefault(each.variant, each)
+    if variant not in variants:
+        raise ValueError(f"variant of {id} must be one of {', '.join(variants)}; got {variant!r}"
+                         + _check.nearest(variant, variants) if variants else
+                         f"{id} has no variants, got {variant!r}")
+    return variants[variant]
 
 
-def registered_by_hand() -> list[Entry]:
-    """Entries that another process does not know by itself."""
-    return [_entries[id] for id in sorted(_by_hand)]
+def runtime_entries() -> list[Entry]:
+    """Return the entries that a script registered, which another process does not have."""
+    return [_entries[id] for id in sorted(_runtime_ids)]
 
 
-def take_over(told: list[Entry]) -> None:
-    """Register what another process has registered by hand, in place of what had its id here."""
-    for each in told:
+def import_entries(imported: list[Entry]) -> None:
+    """Register entries of another process; they replace entries with the same id."""
+    for each in imported:
         gym.registry.pop(each.id, None)
-        _entries[each.id] = each
-        _by_hand.add(each.id)
-        _make_known(each)
+        _add(each)
 
 
 def register_installed() -> None:
-    """Register the worlds of installed packages; one that fails is left out with a warning."""
-    for point in entry_points(group=GROUP):
+    """Register worlds of installed packages; skip a package that fails with a warning."""
+    for point in entry_points(group=WORLDS_GROUP):
         try:
             point.load()
-        except Exception as error:          # somebody else's package must not break ours
+        except Exception as error:          # a third-party package must not break this one
             warnings.warn(f"worlds of {point.value} are left out: {type(error).__name__}: {error}",
                           stacklevel=2)
-    _by_hand.clear()
+    _runtime_ids.clear()

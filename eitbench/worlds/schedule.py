@@ -22,7 +22,7 @@ class Pattern(Protocol):
 
 
 @dataclass(frozen=True)
-class AcrossAndAslant:
+class OppositeDiagonalPattern:
     """Straight across a plane pipe, then aslant, three electrodes further down [ours].
 
     Successive injections are far apart, so that each part of the pipe is seen anew before the fluid
@@ -45,7 +45,7 @@ class AcrossAndAslant:
 
 
 @dataclass(frozen=True)
-class RingsInTurn:
+class RotatingRingPattern:
     """Straight across a ring of a round pipe, then aslant into the next ring down the flow [ours].
 
     The rings take turns, and the angle moves on by three places each time. Electrode number =
@@ -69,7 +69,7 @@ class RingsInTurn:
 
 
 @dataclass(frozen=True)
-class OnePair:
+class SinglePairPattern:
     """The same pair all the time: electrode 0, and the one opposite [T: one pair; ours: which]."""
 
     def __call__(self, vessel: RoundTank) -> np.ndarray:
@@ -77,7 +77,7 @@ class OnePair:
 
 
 @dataclass(frozen=True)
-class AroundTheTank:
+class TankOppositeDiagonalPattern:
     """Eight injections straight across a tank, then eight aslant, far from the last ones [ours]."""
 
     def __call__(self, vessel: RoundTank) -> np.ndarray:
@@ -104,7 +104,7 @@ class Schedule:
     """s between two injections [T]"""
     scored_steps: int = 80
     """injections scored: five frames [ours]"""
-    pattern: Pattern = field(default_factory=AcrossAndAslant)
+    pattern: Pattern = field(default_factory=OppositeDiagonalPattern)
     """the cycle of injections"""
     warm_up: int | None = None
     """injections not scored; None: until the mean flow has flushed the vessel, and a whole frame"""

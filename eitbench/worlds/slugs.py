@@ -10,16 +10,16 @@ from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
-from eitbench.worlds.fields import LATER, check_positive, check_range
-from eitbench.worlds.world import Discretisation, History, Target, World
+from eitbench.worlds.fields import ADDED_LATER, check_positive, check_range
+from eitbench.worlds.world import Discretisation, Target, TruthTrajectory, World
 
 if TYPE_CHECKING:
     from eitbench.physics.transport import Transport
-    from eitbench.worlds.streams import Randomness
+    from eitbench.worlds.random_streams import EpisodeStreams
 
 Inflow = Callable[[np.ndarray, float], np.ndarray]
 """(points (k, d) in m, time in s) -> concentration (k,) in mol/m³"""
-KEPT = 48
+MAX_CACHED_MODELS = 48
 """Transport models of a fine mesh that are kept: a wandering flow comes back to its velocities."""
 
 
@@ -31,7 +31,7 @@ class Arrivals(Protocol):
 
 
 @dataclass(frozen=True)
-class OneInEach:
+class JitteredArrivals:
     """One slug in each interval, at random within it."""
 
     interval: float = 0.020
@@ -46,25 +46,25 @@ class OneInEach:
 
 
 @dataclass(frozen=True)
-class NowAndThen:
+class DeadTimePoissonArrivals:
     """Slugs one at a time, at times nobody foresees; all numbers are ours.
 
     Between two lies at least ``interval``, and then for every moment the same probability that the
     next one comes: how long it has been quiet says nothing of what will be.
     """
 
-    interval: float = 0.10
+    dead_time: float = 0.10
     """s; least time between the centres of two slugs: the first has left the pipe"""
-    wait: float = 0.20
+    mean_wait: float = 0.20
     """s; mean time beyond that"""
 
     def __post_init__(self) -> None:
-        check_positive(self, interval="s", wait="s")
+        check_positive(self, dead_time="s", mean_wait="s")
 
     def draw(self, random: np.random.Generator, begin: float, end: float) -> np.ndarray:
-        n = math.ceil((end - begin) / self.interval) + 1
+        n = math.ceil((end - begin) / self.dead_time) + 1
         # The first wait is shortened at random: the record begins anywhere between two slugs.
-        waits = self.interval + random.exponential(self.wait, n)
+        waits = self.dead_time + random.exponential(self.mean_wait, n)
         waits[0] *= random.uniform()
         when = begin + np.cumsum(waits)
         return when[when < end]
@@ -76,58 +76,58 @@ class Slugs(Target):
 
     background: float = 30.0
     """mol/m³, about 0.3 S/m: weak saline"""
-    strength: tuple[float, float] = (0.22, 0.40)
+    log_amplitude: tuple[float, float] = (0.22, 0.40)
     """|ln(c/background)| at a slug's centre, either sign"""
-    duration: tuple[float, float] = (6e-3, 14e-3)
+    time_std: tuple[float, float] = (6e-3, 14e-3)
     """s, standard deviation in time of a slug's Gaussian"""
-    width: tuple[float, float] = (0.010, 0.025)
+    transverse_std: tuple[float, float] = (0.010, 0.025)
     """m, standard deviation across the pipe"""
-    reach: tuple[float, float] = field(default=(0.0, 0.7), metadata=LATER)
+    radial_range: tuple[float, float] = field(default=(0.0, 0.7), metadata=ADDED_LATER)
     """least and largest distance of a slug's centre from the axis, in parts of R"""
-    arrivals: Arrivals = field(default_factory=OneInEach)
+    arrivals: Arrivals = field(default_factory=JitteredArrivals)
     """when they come"""
 
-    is_carried = True
+    is_advected = True
 
     def __post_init__(self) -> None:
         check_positive(self, background="mol/m³")
-        check_range(self, "strength")
-        check_range(self, "duration", "s")
-        check_range(self, "width", "m")
-        check_range(self, "reach", open_low=False)
-        if not 0 < self.reach[1] <= 1:
-            raise ValueError("reach must end above 0 and at most at 1, at the wall, "
-                             f"got {self.reach!r}")
+        check_range(self, "log_amplitude")
+        check_range(self, "time_std", "s")
+        check_range(self, "transverse_std", "m")
+        check_range(self, "radial_range", open_low=False)
+        if not 0 < self.radial_range[1] <= 1:
+            raise ValueError("radial_range must end above 0 and at most at 1, at the wall, "
+                             f"got {self.radial_range!r}")
 
     def draw_inflow(self, world: World, random: np.random.Generator) -> Inflow:
         """What enters in one episode."""
-        begin = -world.lead_in * world.time_step - 0.05
+        begin = -world.spin_up_steps * world.time_step - 0.05
         end = world.n_steps * world.time_step + 0.05
         when = self.arrivals.draw(random, begin, end)
         n = len(when)
-        where = world.vessel.draw_places(random, n, self.reach)
-        strength = random.choice([-1.0, 1.0], n) * random.uniform(*self.strength, n)
-        duration = random.uniform(*self.duration, n)
-        width = random.uniform(*self.width, n)
+        where = world.vessel.sample_inlet_points(random, n, self.radial_range)
+        strength = random.choice([-1.0, 1.0], n) * random.uniform(*self.log_amplitude, n)
+        duration = random.uniform(*self.time_std, n)
+        width = random.uniform(*self.transverse_std, n)
 
         def inflow(points: np.ndarray, time: float) -> np.ndarray:
-            distance = world.vessel.across(points)[:, None] - where  # (k, n, d − 1)
+            distance = world.vessel.transverse_coordinates(points)[:, None] - where  # (k, n, d − 1)
             bell = np.exp(-0.5 * ((distance / width[:, None])**2).sum(axis=2))
             strengths = strength * np.exp(-0.5 * ((time - when) / duration)**2)
             return np.asarray(self.background * np.exp(bell @ strengths))
 
         return inflow
 
-    def evolve(self, world: World, episodes: Sequence[Randomness], truth: Discretisation,
-               tick: Callable[[int], object], last: int) -> Iterator[History]:
+    def evolve(self, world: World, episodes: Sequence[EpisodeStreams], truth: Discretisation,
+               tick: Callable[[int], object], last: int) -> Iterator[TruthTrajectory]:
         flows = [world.flow.draw(world, episode.flow) for episode in episodes]
         inflows = [self.draw_inflow(world, episode.inflow) for episode in episodes]
         if flows[0] is None:  # one flow carries all of them together
-            for concentration in carry(world, lambda t: truth.transport, inflows, tick, last):
-                yield History(concentration, np.empty((last, 0)))
+            for concentration in advect(world, lambda t: truth.transport, inflows, tick, last):
+                yield TruthTrajectory(concentration, np.empty((last, 0)))
             return
 
-        @lru_cache(maxsize=KEPT)
+        @lru_cache(maxsize=MAX_CACHED_MODELS)
         def transport(velocity: object) -> Transport:
             return truth.transport.with_velocity(velocity)  # type: ignore[attr-defined]
 
@@ -135,13 +135,13 @@ class Slugs(Target):
         points = np.empty(0) if model is None else model.points
         for flow, inflow in zip(flows, inflows, strict=True):
             assert flow is not None
-            (concentration,) = carry(world, lambda t: transport(flow(t)),  # noqa: B023
+            (concentration,) = advect(world, lambda t: transport(flow(t)),  # noqa: B023
                                      [inflow], tick, last)
             velocity = np.array([flow(t).profile(points) for t in range(1, last + 1)])
-            yield History(concentration, velocity)
+            yield TruthTrajectory(concentration, velocity)
 
 
-def carry(world: World, transport_at: Callable[[int], Transport], inflows: Sequence[Inflow],
+def advect(world: World, transport_at: Callable[[int], Transport], inflows: Sequence[Inflow],
           tick: Callable[[int], object], last: int) -> np.ndarray:
     """Concentrations (B, last + 1, n) in mol/m³ that B inflows make in one flow, t = 0 … last.
 
@@ -149,11 +149,11 @@ def carry(world: World, transport_at: Callable[[int], Transport], inflows: Seque
     mesh and inlet do not change. The vessel holds the background when the lead-in begins. ``tick``
     as in `Target.evolve`.
     """
-    first = transport_at(1 - world.lead_in)
+    first = transport_at(1 - world.spin_up_steps)
     inlet = first.mesh.points[first.inlet]
     states = np.empty((len(inflows), last + 1, first.mesh.n_nodes))
     c = np.full((first.mesh.n_nodes, len(inflows)), world.background)
-    for t in range(-world.lead_in + 1, last + 1):
+    for t in range(-world.spin_up_steps + 1, last + 1):
         transport = transport_at(t)
         dt = transport.time_step
         for k in range(round(world.time_step / dt)):

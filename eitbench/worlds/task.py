@@ -92,13 +92,13 @@ def make_task(world: World, lag: int | str = 0, **assumed: Any) -> Task:
     lag : int or "all"
         See `Task`; "all" means the whole record.
     assumed
-        What the estimator wrongly believes of the flow, as ``mean_velocity``; see `World.model`.
+        Wrong assumptions on the flow, as ``mean_velocity``; see `World.estimator_model`.
     """
     steps = lag_steps(world, lag)
-    model = _model(world.fluid, tuple(sorted(assumed.items())))
+    model = _model(world.truth_config, tuple(sorted(assumed.items())))
     currents = world.currents
     currents.setflags(write=False)                                # shared by all who play this task
-    return Task(model.transport, model.observation, world.instrument.believed_noise, currents,
+    return Task(model.transport, model.observation, world.instrument.model_noise, currents,
                 world.n_steps, world.warm_up, steps, world.expected_concentration,
                 world.calibration, world.prior, world.velocity_model, world.vessel, world.name)
 
@@ -114,4 +114,4 @@ def lag_steps(world: World, lag: int | str) -> int:
 @lru_cache(maxsize=4)
 def _model(fluid: World, assumed: tuple[tuple[str, Any], ...]) -> Discretisation:
     """Built once a process; estimators keep what they derive from it with it."""
-    return fluid.model(**dict(assumed))
+    return fluid.estimator_model(**dict(assumed))

@@ -14,7 +14,7 @@ from eitbench.worlds.fields import check_positive
 
 if TYPE_CHECKING:
     from eitbench.numerics.mesh import Mesh
-    from eitbench.numerics.mesh_files import MeshFile
+    from eitbench.numerics.mesh_files import MeshData
     from eitbench.physics.cem import CompleteElectrodeModel
 
 
@@ -53,7 +53,7 @@ class PlanePipe:
     """R in m [T]"""
     electrodes_per_wall: int = 8
     """16 in all, on both walls [ours]"""
-    electrode_cover: float = 0.5
+    electrode_coverage: float = 0.5
     """part of the wall that electrodes cover, evenly spaced [ours]"""
     contact_impedance: float = 2e-3
     """z in Ω·m² [ours]"""
@@ -62,10 +62,10 @@ class PlanePipe:
     bulge: Bulge | None = None
     """of the lower wall"""
 
-    patches = (12, 3)
-    is_long = True
-    parts_of_a_step = 2
-    lines = 40  # parts of its length whose ends are lines of both carriers' meshes
+    coarse_grid_shape = (12, 3)
+    is_elongated = True
+    n_truth_steps = 2
+    n_mesh_lines = 40  # parts of its length whose ends are lines of both carriers' meshes
 
     def __post_init__(self) -> None:
         check_positive(self, length="m", half_width="m")
@@ -84,7 +84,7 @@ class PlanePipe:
         """(electrodes_per_wall, 2) start and end in m along the wall."""
         pitch = self.length / self.electrodes_per_wall
         centres = (np.arange(self.electrodes_per_wall) + 0.5) * pitch
-        return centres[:, None] + 0.5 * self.electrode_cover * pitch * np.array([-1.0, 1.0])
+        return centres[:, None] + 0.5 * self.electrode_coverage * pitch * np.array([-1.0, 1.0])
 
     def electrodes(self, mesh: Mesh) -> list[np.ndarray]:
         """Boundary facets of each electrode, on a mesh of the straight pipe with nodes at edges."""
@@ -94,18 +94,18 @@ class PlanePipe:
         spans = [(x > begin - tiny) & (x < end + tiny) for begin, end in self.electrode_spans]
         return [mesh.facets_of(wall & span) for wall in walls for span in spans]
 
-    def laminar(self, mean_velocity: float) -> PlaneChannelFlow:
+    def laminar_velocity(self, mean_velocity: float) -> PlaneChannelFlow:
         """Laminar flow through the straight pipe with this mean velocity in m/s."""
         return PlaneChannelFlow(mean_velocity, self.half_width)
 
-    def across(self, points: np.ndarray) -> np.ndarray:
+    def transverse_coordinates(self, points: np.ndarray) -> np.ndarray:
         """(k, 1) coordinates across the pipe of points (k, 2), in m."""
         return points[:, 1:2]
 
-    def draw_places(self, random: np.random.Generator, n: int,
+    def sample_inlet_points(self, random: np.random.Generator, n: int,
                     reach: tuple[float, float] = (0.0, 0.7)) -> np.ndarray:
-        """(n, 1) places on the inlet in m, as `across` counts them, ``reach`` from the axis in
-        parts of R."""
+        """Draw n points of the inlet: their `transverse_coordinates` (n, 1) in m, at distances from
+        the axis in the range ``reach``, relative to R."""
         low, high = reach
         beyond = random.uniform(low - high, high - low, n)[:, None]
         return (beyond + np.copysign(low, beyond)) * self.half_width
@@ -113,14 +113,14 @@ class PlanePipe:
     def substeps(self, fine: bool) -> int:
         return 16 if fine else 8
 
-    def carrier(self, fine: bool) -> tuple[Mesh, np.ndarray]:
+    def transport_mesh(self, fine: bool) -> tuple[Mesh, np.ndarray]:
         """10,251 nodes for the truth, 1,701 for the model."""
         # finite elements: not needed to play recordings
         from eitbench.numerics.mesh import rectangle_mesh
         along, across = (200, 50) if fine else (80, 20)
         mesh = rectangle_mesh(np.linspace(0.0, self.length, along + 1),
                               np.linspace(-self.half_width, self.half_width, across + 1))
-        return self.shaped(mesh), np.arange(across + 1)
+        return self.deform(mesh), np.arange(across + 1)
 
     def electrode_model(self, fine: bool) -> CompleteElectrodeModel:
         """About 18,000 unknowns for the truth, 4,600 for the model."""
@@ -129,14 +129,14 @@ class PlanePipe:
         at_electrodes, across = (10, 28) if fine else (5, 14)
         straight = graded_pipe_mesh(self.length, self.half_width, self.electrode_spans,
                                     at_electrodes, across)
-        return CompleteElectrodeModel(self.shaped(straight), self.electrodes(straight),
+        return CompleteElectrodeModel(self.deform(straight), self.electrodes(straight),
                                       self.contact_impedance)
 
     def lower_wall(self, x: np.ndarray) -> np.ndarray:
         """y of the lower wall in m at ``x`` in m."""
         return (0.0 if self.bulge is None else self.bulge(x)) - self.half_width * np.ones_like(x)
 
-    def shaped(self, mesh: Mesh) -> Mesh:
+    def deform(self, mesh: Mesh) -> Mesh:
         """A mesh of the straight pipe, bent to this pipe's walls."""
         if self.bulge is None:
             return mesh
@@ -164,7 +164,7 @@ class RoundPipe:
     """32 electrodes in all [ours]"""
     electrode_length: float = 0.04
     """m along the pipe [ours]"""
-    electrode_cover: float = 0.5
+    electrode_coverage: float = 0.5
     """part of a ring that electrodes cover, evenly spaced [ours]"""
     contact_impedance: float = 2e-3
     """z in Ω·m² [ours]"""
@@ -174,9 +174,9 @@ class RoundPipe:
     """of the elements for the potential. At equal numbers of unknowns P1 errs three times as much,
     by more than the noise: ``docs/pipe3d.md``"""
 
-    patches = (6, 6)
-    is_long = True
-    parts_of_a_step = 2
+    coarse_grid_shape = (6, 6)
+    is_elongated = True
+    n_truth_steps = 2
 
     def __post_init__(self) -> None:
         check_positive(self, length="m", radius="m", electrode_length="m")
@@ -196,7 +196,7 @@ class RoundPipe:
     @property
     def spans_around(self) -> np.ndarray:
         """(electrodes_per_ring, 2) first and last angle of each electrode of a ring in rad."""
-        return _spans_around(self.electrodes_per_ring, self.electrode_cover)
+        return _spans_around(self.electrodes_per_ring, self.electrode_coverage)
 
     @property
     def spans_along(self) -> np.ndarray:
@@ -214,18 +214,18 @@ class RoundPipe:
             facets += _electrodes_around(mesh, self.radius, self.spans_around, ring)
         return facets
 
-    def laminar(self, mean_velocity: float) -> RoundPipeFlow:
+    def laminar_velocity(self, mean_velocity: float) -> RoundPipeFlow:
         """Laminar flow with this mean velocity in m/s."""
         return RoundPipeFlow(mean_velocity, self.radius)
 
-    def across(self, points: np.ndarray) -> np.ndarray:
+    def transverse_coordinates(self, points: np.ndarray) -> np.ndarray:
         """(k, 2) coordinates across the pipe of points (k, 3), in m."""
         return points[:, :2]
 
-    def draw_places(self, random: np.random.Generator, n: int,
+    def sample_inlet_points(self, random: np.random.Generator, n: int,
                     reach: tuple[float, float] = (0.0, 0.7)) -> np.ndarray:
-        """(n, 2) places on the inlet in m, as `across` counts them, ``reach`` from the axis in
-        parts of R; every area as often."""
+        """Draw n points of the inlet, uniformly by area: their `transverse_coordinates` (n, 2) in
+        m, at distances from the axis in the range ``reach``, relative to R."""
         low, high = reach
         inner = (low / high)**2
         distance = high * self.radius * np.sqrt(inner + (1.0 - inner) * random.uniform(size=n))
@@ -235,10 +235,10 @@ class RoundPipe:
     def substeps(self, fine: bool) -> int:
         return 8
 
-    def carrier(self, fine: bool) -> tuple[Mesh, np.ndarray]:
+    def transport_mesh(self, fine: bool) -> tuple[Mesh, np.ndarray]:
         """13,689 nodes for the truth, 3,003 for the model."""
         # finite elements: not needed to play recordings
-        from eitbench.numerics.round import extrude, uniform_disc
+        from eitbench.numerics.round_meshes import extrude, uniform_disc
         rings, layers = (7, 80) if fine else (5, 32)
         section = uniform_disc(self.radius, rings)
         mesh = extrude(section, np.linspace(0.0, self.length, layers + 1))
@@ -246,7 +246,7 @@ class RoundPipe:
 
     def electrode_model(self, fine: bool) -> CompleteElectrodeModel:
         """About 42,000 unknowns for the truth, 21,000 for the model."""
-        from eitbench.numerics.round import round_pipe_mesh
+        from eitbench.numerics.round_meshes import round_pipe_mesh
         from eitbench.physics.cem import CompleteElectrodeModel
         at_electrodes, rings, across = ((4, 5), 5, 1.75) if fine else ((3, 4), 4, 1.5)
         mesh = round_pipe_mesh(self.length, self.radius, self.spans_around, self.spans_along,
@@ -263,16 +263,16 @@ class RoundTank:
     """m"""
     n_electrodes: int = 16
     """around the wall; number 0 at angle 0, counted counter-clockwise"""
-    electrode_cover: float = 0.5
+    electrode_coverage: float = 0.5
     """part of the wall that electrodes cover, evenly spaced"""
     contact_impedance: float = 2e-3
     """z in Ω·m²"""
     molar_conductivity: float = 0.01
     """Λ in S·m²/mol; σ = Λc"""
 
-    patches = (6, 6)
-    is_long = False
-    parts_of_a_step = 1
+    coarse_grid_shape = (6, 6)
+    is_elongated = False
+    n_truth_steps = 1
 
     def __post_init__(self) -> None:
         check_positive(self, radius="m")
@@ -282,7 +282,7 @@ class RoundTank:
     @property
     def electrode_spans(self) -> np.ndarray:
         """(L, 2) first and last angle of each electrode in rad."""
-        return _spans_around(self.n_electrodes, self.electrode_cover)
+        return _spans_around(self.n_electrodes, self.electrode_coverage)
 
     def electrodes(self, mesh: Mesh) -> list[np.ndarray]:
         """Boundary facets of each electrode, on an EIT mesh with nodes at their edges."""
@@ -291,14 +291,14 @@ class RoundTank:
     def substeps(self, fine: bool) -> int:
         return 8
 
-    def carrier(self, fine: bool) -> tuple[Mesh, np.ndarray]:
+    def transport_mesh(self, fine: bool) -> tuple[Mesh, np.ndarray]:
         """4,921 nodes for the truth, 1,261 for the model; nothing flows in."""
-        from eitbench.numerics.round import uniform_disc  # not needed to play recordings
+        from eitbench.numerics.round_meshes import uniform_disc  # not needed to play recordings
         return uniform_disc(self.radius, 40 if fine else 20), np.empty(0, dtype=int)
 
     def electrode_model(self, fine: bool) -> CompleteElectrodeModel:
         """About 9,300 unknowns for the truth, 3,100 for the model."""
-        from eitbench.numerics.round import electrode_disc
+        from eitbench.numerics.round_meshes import electrode_disc
         from eitbench.physics.cem import CompleteElectrodeModel
         at_electrodes, rings = (8, 22) if fine else (4, 13)
         mesh = electrode_disc(self.radius, self.electrode_spans, at_electrodes, rings)
@@ -314,13 +314,13 @@ class MeshVessel:
     "electrode l", those through which the fluid enters the group "inlet", if there is one.
     """
 
-    fine_file: str
+    truth_mesh_file: str
     """path of the truth's mesh"""
-    fine_sha256: str
+    truth_mesh_sha256: str
     """of that file, in hexadecimal digits: another file is another world"""
-    coarse_file: str
+    model_mesh_file: str
     """path of the model's mesh"""
-    coarse_sha256: str
+    model_mesh_sha256: str
     """of that file"""
     n_electrodes: int
     """L"""
@@ -330,23 +330,23 @@ class MeshVessel:
     """z in Ω·m²"""
     molar_conductivity: float = 0.01
     """Λ in S·m²/mol; σ = Λc"""
-    patches: tuple[int, int] = (6, 6)
+    coarse_grid_shape: tuple[int, int] = (6, 6)
     """along x and y: the coarse grid on which an agent sees an estimate"""
-    is_long: bool = False
+    is_elongated: bool = False
     """whether pictures of it are laid one below the other"""
 
-    parts_of_a_step = 2
+    n_truth_steps = 2
 
     def __post_init__(self) -> None:
         check_positive(self, scale="m", contact_impedance="Ω·m²", molar_conductivity="S·m²/mol")
         _check.integer("n_electrodes", self.n_electrodes, low=2)
-        for count in self.patches:
-            _check.integer("each entry of patches", count, low=1)
+        for count in self.coarse_grid_shape:
+            _check.integer("each entry of coarse_grid_shape", count, low=1)
 
     def substeps(self, fine: bool) -> int:
         return 16 if fine else 8
 
-    def carrier(self, fine: bool) -> tuple[Mesh, np.ndarray]:
+    def transport_mesh(self, fine: bool) -> tuple[Mesh, np.ndarray]:
         mesh, groups = self._read(fine)
         return mesh, np.unique(groups.get("inlet", np.empty(0, dtype=int)))
 
@@ -362,17 +362,18 @@ class MeshVessel:
 
     def _file(self, fine: bool) -> tuple[str, str]:
         if fine:
-            return self.fine_file, self.fine_sha256
-        return self.coarse_file, self.coarse_sha256
+            return self.truth_mesh_file, self.truth_mesh_sha256
+        return self.model_mesh_file, self.model_mesh_sha256
 
-    def _read(self, fine: bool) -> MeshFile:
+    def _read(self, fine: bool) -> MeshData:
         return _read(*self._file(fine), self.scale)
 
 
 def _check_electrodes(vessel: PlanePipe | RoundPipe | RoundTank) -> None:
     """``ValueError`` unless these numbers of its electrodes and liquid are within their ranges."""
     check_positive(vessel, contact_impedance="Ω·m²", molar_conductivity="S·m²/mol")
-    _check.number("electrode_cover", vessel.electrode_cover, low=0.0, high=0.95, open_low=True)
+    _check.number("electrode_coverage", vessel.electrode_coverage, low=0.0, high=0.95,
+                  open_low=True)
 
 
 def _spans_around(count: int, cover: float) -> np.ndarray:
@@ -395,6 +396,6 @@ def _electrodes_around(mesh: Mesh, radius: float, spans: np.ndarray,
 
 
 @lru_cache(maxsize=4)
-def _read(path: str, sha256: str, scale: float) -> MeshFile:
+def _read(path: str, sha256: str, scale: float) -> MeshData:
     from eitbench.numerics.mesh_files import read_mesh
     return read_mesh(path, sha256, scale=scale)

@@ -13,8 +13,14 @@ from eitbench import _check
 from eitbench.physics.observation import LinearConductivity, ObservationModel, VoltageNoise
 from eitbench.worlds.fields import check_positive
 from eitbench.worlds.instrument import Instrument
+from eitbench.worlds.random_streams import EpisodeStreams, episode_streams
 from eitbench.worlds.schedule import Schedule
-from eitbench.worlds.streams import Randomness, randomness
+from eitbench.worlds.stored_names import (
+    WORLD_MEMBERS,
+    add_current_members,
+    current_field_name,
+    warn_renamed,
+)
 
 if TYPE_CHECKING:
     from eitbench.numerics.mesh import Mesh
@@ -30,7 +36,7 @@ class Discretisation(NamedTuple):
     observation: ObservationModel
 
 
-class History(NamedTuple):
+class TruthTrajectory(NamedTuple):
     """What moved in one episode."""
 
     concentration: np.ndarray
@@ -55,18 +61,18 @@ class Vessel(Protocol):
         """L."""
 
     @property
-    def patches(self) -> tuple[int, int]:
+    def coarse_grid_shape(self) -> tuple[int, int]:
         """Along x and y: the coarse grid on which an agent sees an estimate."""
 
     @property
-    def is_long(self) -> bool:
+    def is_elongated(self) -> bool:
         """Whether pictures of it are laid one below the other."""
 
-    def carrier(self, fine: bool) -> tuple[Mesh, np.ndarray]:
+    def transport_mesh(self, fine: bool) -> tuple[Mesh, np.ndarray]:
         """The mesh on which concentration moves, ``fine`` for the truth, and its inlet's nodes."""
 
     @property
-    def parts_of_a_step(self) -> int:
+    def n_truth_steps(self) -> int:
         """Steps of the truth's transport in a time step."""
 
     def substeps(self, fine: bool) -> int:
@@ -87,21 +93,21 @@ class Flow(Protocol):
         """The velocity of the truth (``fine``) or the estimators' model; None: nothing moves."""
 
     def check_assumed(self, world: World, assumed: Mapping[str, Any]) -> None:
-        """``ValueError`` if `believed` knows nothing of what is assumed; at no cost."""
-        refuse_assumptions(assumed, ())
+        """``ValueError`` if `assumed_velocity` knows nothing of what is assumed; at no cost."""
+        reject_unknown_assumptions(assumed, ())
 
-    def believed(self, world: World, **assumed: Any) -> VelocityField | None:
+    def assumed_velocity(self, world: World, **assumed: Any) -> VelocityField | None:
         """The velocity of the estimators' model; ``assumed``: what they are told instead."""
         self.check_assumed(world, assumed)
         return self.nominal(world, fine=False)
 
-    def flush_steps(self, world: World) -> int:
+    def residence_steps(self, world: World) -> int:
         """Time steps in which the mean flow passes through the vessel; 0 where nothing does."""
         return 0
 
-    def lead_in(self, world: World) -> int:
+    def spin_up_steps(self, world: World) -> int:
         """Time steps that the fluid flows before t = 0: the slowest flow has flushed the vessel."""
-        return self.flush_steps(world)
+        return self.residence_steps(world)
 
     def velocity_model(self, world: World) -> VelocityModel | None:
         """How the flow may be written where it is to be estimated too."""
@@ -132,16 +138,16 @@ class Target(Protocol):
         """Concentration (mol/m³) that fills the vessel at first."""
 
     @property
-    def is_carried(self) -> bool:
+    def is_advected(self) -> bool:
         """Whether the fluid carries the truth; else the target has a way of its own."""
 
     @property
-    def stands_still(self) -> bool:
+    def is_stationary(self) -> bool:
         """Whether nothing has to be followed: such worlds have boards of their own."""
         return False
 
-    def evolve(self, world: World, episodes: Sequence[Randomness], truth: Discretisation,
-               tick: Callable[[int], object], last: int) -> Iterator[History]:
+    def evolve(self, world: World, episodes: Sequence[EpisodeStreams], truth: Discretisation,
+               tick: Callable[[int], object], last: int) -> Iterator[TruthTrajectory]:
         """What moves in each episode up to state ``last``; to the bit the same beside any others.
 
         ``tick(k)`` is called when k more steps of one episode are done.
@@ -196,18 +202,20 @@ class World:
 
     def __post_init__(self) -> None:
         for name, protocol in (("vessel", Vessel), ("flow", Flow), ("target", Target)):
+            add_current_members(type(getattr(self, name)))
             _check_part(name, getattr(self, name), protocol)
         for part in (self.vessel, self.flow, self.target):
             if hasattr(part, "check"):
                 part.check(self)
-        if self.instrument.most > self.vessel.n_electrodes - 2:
-            raise ValueError("instrument: dead, failing and loose must leave two electrodes sound, "
-                             f"got up to {self.instrument.most} of {self.vessel.n_electrodes}")
+        if self.instrument.max_faulty > self.vessel.n_electrodes - 2:
+            raise ValueError("instrument: n_dead_range, n_failing_range and n_loose_range must "
+                             "leave two electrodes sound, got up to "
+                             f"{self.instrument.max_faulty} of {self.vessel.n_electrodes}")
         if self.region is not None:
             self._check_region(self.region)
 
     def _check_region(self, region: tuple[float, float]) -> None:
-        lines = getattr(self.vessel, "lines", None)
+        lines = getattr(self.vessel, "n_mesh_lines", None)
         if lines is None:
             kind = type(self.vessel).__name__
             raise ValueError(f"region must be None in a {kind}, got {region!r}")
@@ -227,14 +235,14 @@ class World:
         return self.schedule.time_step
 
     @property
-    def flush_steps(self) -> int:
+    def residence_steps(self) -> int:
         """Time steps in which the mean flow passes through the vessel."""
-        return self.flow.flush_steps(self)
+        return self.flow.residence_steps(self)
 
     @property
-    def lead_in(self) -> int:
+    def spin_up_steps(self) -> int:
         """Time steps that the fluid flows before t = 0."""
-        return self.flow.lead_in(self)
+        return self.flow.spin_up_steps(self)
 
     @property
     def warm_up(self) -> int:
@@ -242,7 +250,7 @@ class World:
         once, and there is a whole turn of the pattern."""
         if self.schedule.warm_up is not None:
             return self.schedule.warm_up
-        return max(self.flush_steps, len(self.currents))
+        return max(self.residence_steps, len(self.currents))
 
     @property
     def n_steps(self) -> int:
@@ -289,18 +297,18 @@ class World:
 
     # -- discretisations --
 
-    def truth(self) -> Discretisation:
+    def truth_model(self) -> Discretisation:
         """The fine one that is simulated."""
-        velocity = self.flow.nominal(self, fine=True) if self.target.is_carried else None
+        velocity = self.flow.nominal(self, fine=True) if self.target.is_advected else None
         return self._discretise(velocity, fine=True)
 
-    def model(self, **assumed: Any) -> Discretisation:
+    def estimator_model(self, **assumed: Any) -> Discretisation:
         """The coarser one that estimators are given.
 
-        ``assumed`` is what they wrongly believe of the flow; `Flow.believed` says what there is.
-        ``ValueError`` if it has nothing of this name.
+        ``assumed`` holds wrong assumptions on the flow, arguments of `Flow.assumed_velocity`;
+        ``ValueError`` for an unknown one.
         """
-        return self._discretise(self.flow.believed(self, **assumed), fine=False)
+        return self._discretise(self.flow.assumed_velocity(self, **assumed), fine=False)
 
     def true_transport(self, model: Discretisation,
                        flow: np.random.Generator) -> Callable[[int], Transport]:
@@ -316,41 +324,43 @@ class World:
         """What the voltages of an episode are computed by, of ``truth``: with its electrodes'
         contact impedances, drawn from the episode's fresh stream where they are not those told."""
         seen = truth.observation
-        if self.instrument.contact_spread == 0.0:
+        if self.instrument.contact_impedance_spread == 0.0:
             return seen
         factor = self.instrument.draw_contacts(contacts, self.vessel.n_electrodes)
         return seen.with_contacts(factor * seen.cem.contact_impedance)
 
-    def evolve(self, episodes: Sequence[Randomness], truth: Discretisation,
-               tick: Callable[[int], object], last: int | None = None) -> Iterator[History]:
+    def evolve(self, episodes: Sequence[EpisodeStreams], truth: Discretisation,
+               tick: Callable[[int], object], last: int | None = None) -> Iterator[TruthTrajectory]:
         """What moves in each episode, up to state ``last`` (default: all); see `Target.evolve`."""
         until = self.n_steps if last is None else last
         return self.target.evolve(self, episodes, truth, tick, until)
 
     def sample_inflow(self, seed: int) -> np.ndarray:
-        """(lead_in + n_steps + 1, n_inlet) mol/m³ that enters in the episode of this seed, from the
-        lead-in's beginning on, at the nodes of the model's inlet; without a simulation.
+        """Draw the inflow of an episode, (spin_up_steps + n_steps + 1, n_inlet) in mol/m³, at the
+        nodes of the estimators' inlet from the beginning of the spin-up, without a simulation.
 
         ``ValueError`` if this world has no inlet, or its target does not say what flows in.
         """
         seed = _check.integer("seed", seed, low=0)
         if not hasattr(self.target, "draw_inflow"):
             raise ValueError(f"the target must have an inflow, got {type(self.target).__name__}")
-        mesh, inlet = self.vessel.carrier(fine=False)
-        inflow = self.target.draw_inflow(self, randomness(seed).inflow)
+        mesh, inlet = self.vessel.transport_mesh(fine=False)
+        inflow = self.target.draw_inflow(self, episode_streams(seed).inflow)
         points = mesh.points[np.unique(inlet)]
         return np.array([inflow(points, t * self.time_step)
-                         for t in range(-self.lead_in, self.n_steps + 1)])
+                         for t in range(-self.spin_up_steps, self.n_steps + 1)])
 
     def _discretise(self, velocity: VelocityField | None, fine: bool) -> Discretisation:
-        from eitbench.physics.rest import AtRest  # finite elements: not needed to play recordings
+        from eitbench.physics.stationary import (
+            StationaryTransport,  # finite elements: not needed to play recordings
+        )
         from eitbench.physics.transport import ConvectionDiffusion
-        mesh, inlet = self.vessel.carrier(fine)
+        mesh, inlet = self.vessel.transport_mesh(fine)
         transport: Transport
         if velocity is None:
-            transport = AtRest(mesh, self.time_step)
+            transport = StationaryTransport(mesh, self.time_step)
         else:
-            parts = self.vessel.parts_of_a_step if fine else 1
+            parts = self.vessel.n_truth_steps if fine else 1
             transport = ConvectionDiffusion(
                 mesh, velocity, self.flow.diffusivity, self.time_step / parts,
                 substeps=self.vessel.substeps(fine), inlet=inlet)
@@ -359,6 +369,13 @@ class World:
                                        LinearConductivity(self.vessel.molar_conductivity),
                                        1e-2 * self.expected_concentration)
         return Discretisation(transport, observation)
+
+    def __getattr__(self, name: str) -> Any:
+        """Return a member by its earlier name."""
+        if name not in WORLD_MEMBERS:
+            raise AttributeError(f"World has no attribute {name!r}")
+        warn_renamed(name, WORLD_MEMBERS[name])
+        return getattr(self, WORLD_MEMBERS[name])
 
     def __hash__(self) -> int:
         return self._hash
@@ -373,7 +390,7 @@ class World:
 
     # -- variants --
 
-    def changed(self, changes: Mapping[str, Any] | None) -> World:
+    def with_changes(self, changes: Mapping[str, Any] | None) -> World:
         """This world with some numbers changed, as in ``{"instrument": {"noise_relative": 0.02}}``.
 
         ``ValueError`` naming what there is, if a part or a number has another name, or what is
@@ -388,20 +405,21 @@ class World:
         return _changed(self, changes, "world")
 
     @cached_property
-    def sound(self) -> World:
+    def fault_free(self) -> World:
         """What a filter without faults and floor depends on: variants share theirs."""
         given = self.instrument
         instrument = Instrument(current=given.current, noise_relative=given.noise_relative,
-                                noise_of_largest=given.noise_of_largest)
+                                noise_relative_to_max=given.noise_relative_to_max)
         return replace(self, instrument=instrument, schedule=replace(self.schedule, budget=None))
 
     @cached_property
-    def fluid(self) -> World:
+    def truth_config(self) -> World:
         """What the truth depends on: variants share their episodes. Of the instrument those are the
         currents and the contacts, which show in the transfer resistances."""
         instrument = Instrument(current=self.instrument.current,
-                                contact_spread=self.instrument.contact_spread)
-        return replace(self.sound, instrument=instrument, prior=Prior(self.expected_concentration))
+                                contact_impedance_spread=self.instrument.contact_impedance_spread)
+        prior = Prior(self.expected_concentration)
+        return replace(self.fault_free, instrument=instrument, prior=prior)
 
 
 def _check_part(name: str, part: Any, protocol: type) -> None:
@@ -417,7 +435,8 @@ def _changed(part: Any, changes: Mapping[str, Any], where: str) -> Any:
     if isinstance(part, World):
         known.remove("name")
     made: dict[str, Any] = {}
-    for name, value in changes.items():
+    for given, value in changes.items():
+        name = current_field_name(given, known)
         if name not in known:
             raise ValueError(f"{where} has no {name!r}; there are {', '.join(known)}"
                              + _check.nearest(name, known))
@@ -437,7 +456,7 @@ def _changed(part: Any, changes: Mapping[str, Any], where: str) -> Any:
         raise ValueError(message if message.startswith(where) else f"{where}: {message}") from None
 
 
-def refuse_assumptions(assumed: Mapping[str, Any], known: Sequence[str]) -> None:
+def reject_unknown_assumptions(assumed: Mapping[str, Any], known: Sequence[str]) -> None:
     """``ValueError`` if estimators are told something that this flow knows nothing of."""
     for name in assumed:
         if name not in known:

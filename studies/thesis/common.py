@@ -17,7 +17,7 @@ from tqdm import tqdm
 from eitbench import scoring
 from eitbench.bench.methods import load_method
 from eitbench.bench.playing import estimates
-from eitbench.data.recordings import score_operators
+from eitbench.data.episode_cache import score_operators
 from eitbench.envs.estimation import EstimationEnv
 from eitbench.envs.rendering import SPREAD_MAP, colour_range, draw_electrodes, draw_field
 from eitbench.numerics.mesh import Mesh

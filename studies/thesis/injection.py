@@ -17,7 +17,7 @@ from eitbench.bench.run import run_jobs, unplayed
 from eitbench.bench.store import EpisodeStore, results_in
 from eitbench.bench.suites import jobs as jobs_of
 from eitbench.bench.text import mean_and_interval
-from eitbench.data.seeds import name_seed
+from eitbench.data.seeds import format_seed
 from eitbench.report.animate import animate
 from eitbench.report.policies import OPEN_LOOP, errors_by_policy, gap_text, policy_rows
 
@@ -74,7 +74,7 @@ def injection(seeds: list[int] | None, jobs: int, out: Path) -> tuple[Path, str]
     save_figure(figure, path)
     env, policy = ANIMATED
     first = jobs_of("injection", [env], [policy], seeds)[0].seed
-    animation = animate(env, [policy], name_seed(first), None, out / "injection.gif")
+    animation = animate(env, [policy], format_seed(first), None, out / "injection.gif")
     return path, "\n".join([*tables, f"wrote {animation}: {policy} in {env}"])
 
 

@@ -75,7 +75,8 @@ def _draw_flows(axes: np.ndarray, figure, env: EstimationEnv, world: World) -> f
         return points[:, 1] > pipe.lower_wall(points[:, 0])
 
     flows: dict[str, VelocityField] = {"true flow (Navier–Stokes)": real,
-                                       "assumed: a parabola at each x": world.flow.believed(world)}
+                                       "assumed: a parabola at each x":
+                                           world.flow.assumed_velocity(world)}
     top = max(float(np.hypot(*flow(mesh.points).T).max()) for flow in flows.values())
     for ax, (title, flow) in zip(axes, flows.items(), strict=True):
         mappable = draw_flow(ax, mesh, flow, inside, top)

@@ -108,8 +108,8 @@ def _with_factors(env: EstimationEnv, factors: Factors) -> Task:
 def _transport(world: World, factor: float) -> Transport:
     """Return the model's transport with another diffusivity; cached, since filters cache matrices
     with it."""
-    return world.changed({"flow": {"diffusivity": factor
-                                   * world.flow.diffusivity}}).model().transport
+    return world.with_changes({"flow": {"diffusivity": factor
+                                        * world.flow.diffusivity}}).estimator_model().transport
 
 
 def _filter_error(env: EstimationEnv, task: Task, seed: int) -> float:

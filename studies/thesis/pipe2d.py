@@ -13,7 +13,7 @@ from eitbench import scoring
 from eitbench.bench.methods import load_method
 from eitbench.bench.playing import estimated
 from eitbench.bench.scores import scored
-from eitbench.data.recordings import score_operators
+from eitbench.data.episode_cache import score_operators
 from eitbench.envs.estimation import EstimationEnv
 from eitbench.envs.rendering import SPREAD_MAP, colour_range, draw_field
 

@@ -17,7 +17,7 @@ from eitbench.estimation import CalibrationFrame
 from eitbench.numerics.fem import mass_matrix
 from eitbench.numerics.mesh import Mesh
 from eitbench.scoring import deficit_centre
-from eitbench.worlds.streams import randomness
+from eitbench.worlds.random_streams import episode_streams
 from eitbench.worlds.task import Estimate, Task
 from eitbench.worlds.world import World
 
@@ -126,7 +126,7 @@ def fig7_3(seeds: list[int], _jobs: int, out: Path) -> tuple[Path, str]:
     stationary = run_baseline(env, "gauss_newton", seeds[0])
     constant = run_baseline(env, "homogeneous", seeds[0])
     path = out / "fig7.3.png"
-    centres = disc.path(world, randomness(seeds[0]).flow)[1:]
+    centres = disc.path(world, episode_streams(seeds[0]).flow)[1:]
     distances = [_distances(env, estimates, centres) for estimates in (filtered, stationary)]
     _disc_figure(path, env, filtered, centres, distances)
     by_filter, by_stationary, by_constant = (episode_error(env, each)
@@ -198,11 +198,11 @@ def fig7_4(seeds: list[int], _jobs: int, out: Path) -> tuple[Path, str]:
     Gauss–Newton estimate."""
     env = _at_rest()
     world = env.world
-    metal = world.target.metal
+    metal = world.target.concentration_ratio
     frame = len(env.task.currents)
     filtered = [estimate.mean for estimate in run_baseline(env, "kalman_filter", seeds[0])]
     fitted = run_baseline(env, "map_estimate", seeds[0])[frame - 1].mean
-    cylinders = world.target.draw(world, randomness(seeds[0]).flow)
+    cylinders = world.target.draw(world, episode_streams(seeds[0]).flow)
     truth = env.truth()[0]
     scale = 0.5 * world.background, float(np.ceil(max(filtered[frame - 1].max(), fitted.max()) / 10)
                                           * 10)

@@ -12,7 +12,7 @@ import pytest
 from eitbench.bench.run import Job, run_episode, run_jobs
 from eitbench.bench.store import EpisodeStore
 from eitbench.data import parallel
-from eitbench.data.parallel import BACKENDS, WorkerLost, in_parallel
+from eitbench.data.parallel import BACKENDS, WorkerLostError, run_parallel
 
 from tiny import FILTER, count, write_baseline
 
@@ -73,7 +73,7 @@ def test_here_a_killed_worker_ends_the_run_and_nothing_is_lost(tmp_path):
     log, store = tmp_path / "log", EpisodeStore(tmp_path / "results")
     path = write_baseline(tmp_path, init=KILL.format(log=str(log)))
     jobs = [Job(FILTER, path, seed) for seed in (1, 2, 3)]
-    with pytest.raises(WorkerLost, match="the same command goes on from there"):
+    with pytest.raises(WorkerLostError, match="the same command goes on from there"):
         run_jobs(jobs, store, n_jobs=2)
     finished = len(errors(store))
     assert finished < 3
@@ -85,14 +85,14 @@ def test_here_a_killed_worker_ends_the_run_and_nothing_is_lost(tmp_path):
 def test_backends_that_cannot_be_had(monkeypatch):
     """Unknown, or not installed: a sentence."""
     with pytest.raises(ValueError, match="backend must be one of loky, ray, dask, got 'slurm'"):
-        list(in_parallel(print, [(1,)], 1, "slurm"))
+        list(run_parallel(print, [(1,)], 1, "slurm"))
     with monkeypatch.context() as patch, pytest.raises(ModuleNotFoundError):
         patch.setattr(parallel, "_with_ray", lambda *_: iter(importlib.import_module("ray_is_not_here")))
-        list(in_parallel(print, [(1,)], 1, "ray"))
+        list(run_parallel(print, [(1,)], 1, "ray"))
     for backend, package in CLUSTERS.items():
         if not importlib.util.find_spec(package):
             with pytest.raises(ValueError, match=f"backend {backend} needs {package}, which the extra cluster"):
-                list(in_parallel(print, [(1,)], 1, backend))
+                list(run_parallel(print, [(1,)], 1, backend))
     assert set(BACKENDS) == {"loky", *CLUSTERS}
 
 
@@ -104,7 +104,7 @@ def test_loky_is_silent_when_it_renews_a_worker(recwarn):
     loky = "joblib.externals.loky.process_executor"
     lost = ("A worker stopped while some jobs were given to the executor. This can be caused by a too short worker "
             "timeout or by a memory leak.")
-    assert list(in_parallel(abs, [(-1,)], 1)) == [1]
+    assert list(run_parallel(abs, [(-1,)], 1)) == [1]
     for words, module in ((lost, loky), ("something else", loky), (lost, "mine")):
         warn(words, module)
     assert [str(each.message) for each in recwarn] == ["something else", lost]

@@ -16,8 +16,8 @@ from eitbench.worlds import entry
 from commands import eitbench
 
 IDS = own_ids()
-FLUIDS = list(dict.fromkeys(entry(id).world.fluid for id in IDS))
-BY_FLUID = sorted(IDS, key=lambda id: FLUIDS.index(entry(id).world.fluid))
+FLUIDS = list(dict.fromkeys(entry(id).world.truth_config for id in IDS))
+BY_FLUID = sorted(IDS, key=lambda id: FLUIDS.index(entry(id).world.truth_config))
 METHODS = golden.official_methods()
 BY_ENVIRONMENT = sorted(METHODS, key=lambda name: str((golden.read_golden(name) or {}).get("episodes")))
 SLOW = ("filter_bank", "eitbench-Pipe2DInjectionFlow-v0--ppo")
@@ -80,7 +80,7 @@ def test_versions_of_built_in_methods_are_those_of_their_golden_files(monkeypatc
 def test_constant_off_by_a_thousandth_shows(id, part, name, shows, stays):
     """In the numbers that depend on it, and in no other."""
     value = getattr(getattr(entry(id).world, part), name)
-    world = entry(id).world.changed({part: {name: 1.001 * value}})
+    world = entry(id).world.with_changes({part: {name: 1.001 * value}})
     computed = json.loads(golden.world_text(golden.world_numbers(world, ("train:0",))))
     expected = golden.read_golden(id)
     expected = {"model": expected["model"], "episodes": {"train:0": expected["episodes"]["train:0"]}}

@@ -36,7 +36,7 @@ class Mine(LaminarFlow):
     """A flow of the script's own."""
 
 
-world = PIPE_2D.changed({changes!r})
+world = PIPE_2D.with_changes({changes!r})
 flow = Mine(**{{each.name: getattr(world.flow, each.name) for each in fields(world.flow)}})
 register(replace(world, name="Mine", flow=flow), "mine/Own-v0")
 jobs = [Job(Environment("mine/Own-v0"), {baseline!r}, seed) for seed in (1, 2)]
@@ -59,10 +59,10 @@ def test_an_edited_world_of_a_script_is_played_again(tmp_path):
     register(TINY, ID)
     mine = entry(ID)
     store = EpisodeStore(tmp_path / "results")
-    noisy = TINY.changed({"instrument": {"noise_relative": 0.02}})
-    sure = TINY.changed({"prior": {"inflow_std": 0.5}})
+    noisy = TINY.with_changes({"instrument": {"noise_relative": 0.02}})
+    sure = TINY.with_changes({"prior": {"inflow_std": 0.5}})
     for n, (world, settings) in enumerate([(TINY, {}), (noisy, {}), (sure, {}), (sure, {"lag": 1})], 1):
-        registry.take_over([replace(mine, world=world, settings=settings)])
+        registry.import_entries([replace(mine, world=world, settings=settings)])
         for _ in range(2):
             run_jobs([Job(Environment(ID), path, 1)], store)
         assert count(log) == n
@@ -75,7 +75,7 @@ def test_another_question_is_another_identity(tmp_path):
             Job(FILTER, other, 1)]
     first = jobs[0].identity()
     assert len({job.identity() for job in jobs}) == 5
-    registry.take_over([replace(entry(FILTER.id), world=replace(entry(FILTER.id).world))])
+    registry.import_entries([replace(entry(FILTER.id), world=replace(entry(FILTER.id).world))])
     assert Job(FILTER, path, 1).identity() == first
 
 

@@ -223,7 +223,7 @@ NEEDS_ROOT = {"password hashes", "another root"}
 def reached(tmp_path_factory):
     """What the attempts reach in this process, and under bubblewrap."""
     folder = tmp_path_factory.mktemp("secret")
-    truth = simulate(PIPE_2D.changed(SCENARIO), 3, progress=False).concentration
+    truth = simulate(PIPE_2D.with_changes(SCENARIO), 3, progress=False).concentration
     here = {"truth": truth, "a container, which the collector lists": []}
     np.savez(folder / "truth.npz", truth)
     shared = Path("/dev/shm", f"eitbench-test-{os.getpid()}")

@@ -142,7 +142,7 @@ def test_what_is_thought_later_is_of_the_same_state(study, short, monkeypatch):
 ])
 def test_it_plays_the_task_that_it_was_trained_for(changes, assumed, plays):
     """Other records of the same pipe too; no other vessel, and no other model of the flow."""
-    task = make_task(entry(ID).world.changed(changes), **assumed)
+    task = make_task(entry(ID).world.with_changes(changes), **assumed)
     assert load_method("learned_correction", "estimation").suits(task) == plays
 
 

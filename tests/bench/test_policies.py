@@ -157,7 +157,7 @@ def test_the_action_of_a_pair_injects_it(name):
 @pytest.mark.parametrize("budget", [0, 1, 7, 30, 182, 500])
 def test_an_even_budget_is_spent_exactly(budget):
     """So many injections, or one at each step; between two of them the same number of steps, give or take one."""
-    rules = Rules(PIPE_2D.changed({"schedule": {"scored_steps": 180, "budget": budget}}))
+    rules = Rules(PIPE_2D.with_changes({"schedule": {"scored_steps": 180, "budget": budget}}))
     steps = rules.world.n_steps - 16
     when = np.flatnonzero([rules.spaced(np.array([left, 0.0])) for left in range(steps, 0, -1)])
     assert len(when) == min(budget, steps)

@@ -11,7 +11,7 @@ from eitbench.bench.methods import load_method
 from eitbench.bench.scores import Outcome, scored
 from eitbench.bench.tracks import Environment
 from eitbench.bench.verify import differences_of
-from eitbench.data.recordings import mass_between
+from eitbench.data.episode_cache import mass_between
 from eitbench.numerics.fem import mass_matrix
 from eitbench.worlds import entry
 
@@ -52,7 +52,7 @@ def test_claims_are_those_of_the_filter_inside(name):
         load_method("random_pair", "injection"), SEED)
     seen = again(name, played.currents)
     env = make("reduced", name).unwrapped
-    mesh = env.world.truth().transport.mesh
+    mesh = env.world.truth_model().transport.mesh
     onto = env.task.mesh.interpolation_to(mesh.points)
     mass = mass_between(mesh, *env.world.region) if env.world.region else mass_matrix(mesh)
     weights = np.asarray(mass.sum(axis=0)).ravel()

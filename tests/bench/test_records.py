@@ -289,7 +289,7 @@ def test_arguments_that_there_are_not(kwargs, message, tmp_path):
 def test_the_arguments_are_those_of_the_environments():
     """And no others."""
     for track, single in (("estimation", EstimationEnv), ("injection", InjectionEnv)):
-        assert sorted(ARGUMENTS[track]) == sorted(set(signature(single).parameters) - {"name"})
+        assert sorted(ARGUMENTS[track]) == sorted(set(signature(single).parameters) - {"name", "variant"})
 
 
 @pytest.mark.parametrize("text", ["1e999", "-1e999", "NaN", "Infinity", "9" * 400, "9" * 5000, '"\\ud800"',

@@ -16,7 +16,7 @@ from eitbench.bench.run import Job, run_episode, run_jobs
 from eitbench.bench.store import EpisodeStore
 from eitbench.bench.tracks import Environment, board_of
 from eitbench.data.cache import CACHE_VARIABLE
-from eitbench.data.episodes import simulate, truth_discretisation
+from eitbench.data.episodes import cached_truth_model, simulate
 from eitbench.worlds.catalogue import PIPE_2D
 from eitbench.worlds.task import Estimate, Task
 from scipy.optimize import minimize_scalar
@@ -86,7 +86,7 @@ def test_nothing_but_the_scored_states_must_be_claimed(tmp_path):
     (claimed, fields), (unclaimed, _) = (
         run_episode(Job(FILTER, write_baseline(tmp_path, update=late.format(first)), 1)) for first in (2, 3))
     claimed, unclaimed = claimed["scores"], unclaimed["scores"]
-    warm_up = PIPE_2D.changed(SCENARIO).warm_up
+    warm_up = PIPE_2D.with_changes(SCENARIO).warm_up
     assert warm_up == 2 and np.isnan(fields["std"][:warm_up]).all() and (fields["std"][warm_up:] == 2).all()
     calibration = ("crps", "coverage_50", "coverage_90", "spread_ratio")
     assert all(claimed[name] is not None for name in calibration)
@@ -211,7 +211,7 @@ def tilted(tmp_path_factory):
         store = EpisodeStore(folder)
         run_jobs([Job(FILTER, path, 4)], store)
         (result,) = store.results()
-        return result, store.fields(result)["mean"].astype(float), simulate(PIPE_2D.changed(SCENARIO), 4)
+        return result, store.fields(result)["mean"].astype(float), simulate(PIPE_2D.with_changes(SCENARIO), 4)
 
 
 def squared(mesh, values):
@@ -239,7 +239,7 @@ def test_scores_can_be_recomputed_from_what_is_stored(tilted):
     """Relative and contrast error follow from the stored estimates and the simulated truth, by other code."""
     result, means, episode = tilted
     env = FILTER.make()
-    mesh, truth = truth_discretisation(env.world).transport.mesh, episode.concentration[1:].astype(float)
+    mesh, truth = cached_truth_model(env.world).transport.mesh, episode.concentration[1:].astype(float)
     error = squared(mesh, interpolated(env.task.mesh, means, mesh.points) - truth)[2:]
     steps = error / squared(mesh, truth)[2:]
     np.testing.assert_allclose(result["step_errors"], steps, rtol=1e-9)

@@ -17,7 +17,7 @@ from eitbench.bench.scores import SCORING
 from eitbench.bench.store import EpisodeStore, machine, portable_command, provenance, results_of
 from eitbench.bench.tracks import Environment
 from eitbench.data.cache import CACHE_VARIABLE
-from eitbench.data.seeds import name_seed
+from eitbench.data.seeds import format_seed
 
 from tiny import FILTER, FIXED_LAG, RUN, SCENARIO, git_says, sha, write_baseline
 
@@ -37,7 +37,7 @@ def store(tmp_path):
 
 def result(seed=1, method="mine", **changes):
     """A result such as `run_episode` makes."""
-    return {"identity": "abc", "seed": name_seed(seed), "method": method, "title": "Mine", "parameters": {},
+    return {"identity": "abc", "seed": format_seed(seed), "method": method, "title": "Mine", "parameters": {},
             "role": None, "privileged": False, "method_sha256": sha("mine"), "version": sha("mine")[:8],
             "checkpoint_sha256": None,
             "board": "filter", "environment": {"id": ENV, "name": "eitbench-Pipe2D-v0", "kwargs": {}},
@@ -196,7 +196,7 @@ def test_splits_are_not_mixed(store):
     """Development and training seeds never enter the record of another split; seeds are in numerical order."""
     for seed in (10, 9, 100):
         put(store, result(seed))
-    store.put(ENV, "mine", 100_001, result(1) | {"seed": name_seed(100_001)}, {})
+    store.put(ENV, "mine", 100_001, result(1) | {"seed": format_seed(100_001)}, {})
     assert sorted(tuple(record["seeds"]) for record in store.write_records()) == [
         ("dev:1",), ("train:9", "train:10", "train:100")]
 

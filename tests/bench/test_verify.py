@@ -188,12 +188,12 @@ def test_numbers_decide_and_not_the_text(monkeypatch):
 def test_the_cache_is_not_used(mine, tmp_path, monkeypatch):
     """A cache in which test:0 is another, easier episode makes a better score, but no record that agrees."""
     monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path / "cache"))
-    world, seed = PIPE_2D.changed(SCENARIO), parse_seeds("test:0")[0]
+    world, seed = PIPE_2D.with_changes(SCENARIO), parse_seeds("test:0")[0]
     honest = simulate(world, seed, progress=False)
     flat = honest._replace(concentration=np.full_like(honest.concentration, world.expected_concentration))
     shutil.rmtree(folder(world))
     with monkeypatch.context() as patch:
-        patch.setattr("eitbench.data.episodes.simulate_together", lambda *_: iter([flat]))
+        patch.setattr("eitbench.data.episodes.simulate_batch", lambda *_: iter([flat]))
         path = submitted(mine)
     assert list(folder(world).glob("*.truth.npy"))
     assert eitbench("verify", path, "--method", mine, *HERE)[0] == 1

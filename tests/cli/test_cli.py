@@ -49,7 +49,7 @@ def tiny_world(monkeypatch, tmp_path):
     git_says(monkeypatch)
     shorten(monkeypatch, {name: TINY if name in PLAIN else world(name)["world"] for name in ids()})
     lagged = replace(entry("eitbench/Pipe2DFixedLag-v0"), settings={"lag": 2})
-    registry.take_over([lagged])
+    registry.import_entries([lagged])
     monkeypatch.chdir(tmp_path)
     (tmp_path / "mine.py").write_text(MINE)
 
@@ -110,8 +110,8 @@ def test_suites():
     missing = {job for job in full if job.environment.id in plain} - set(quick)
     assert missing == {suites.Job(suites.Environment(PIPE), "gauss_newton", 1)} and set(quick) < set(full)
     assert {job.method for job in full} == set(own_methods("estimation")) - real_only
-    assert set(parse_seeds(tracks.QUICK_SEEDS)) < set(parse_seeds(entry(PIPE).seeds))
-    assert min(parse_seeds(entry(PIPE).seeds)) == 200_000
+    assert set(parse_seeds(tracks.QUICK_SEEDS)) < set(parse_seeds(entry(PIPE).test_seeds))
+    assert min(parse_seeds(entry(PIPE).test_seeds)) == 200_000
     asked_for = suites.jobs("estimation", [PIPE], ["gauss_newton"], [1, 2], suite="quick")
     assert [job.seed for job in asked_for] == [1, 2]
 

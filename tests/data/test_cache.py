@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from eitbench._files import write_atomically
 from eitbench.data import cache
-from eitbench.data.cache import CACHE_VARIABLE, Key, cache_folder, cached, described, folder, is_cached
+from eitbench.data.cache import CACHE_VARIABLE, Key, cache_folder, cached, config_dict, folder, is_cached
 from eitbench.worlds import flows
 from eitbench.worlds.flows import LaminarFlow
 from eitbench.worlds.instrument import Instrument
@@ -174,7 +174,7 @@ def test_cache_folder(monkeypatch, tmp_path):
 
 def test_worlds_of_other_numbers_have_other_folders():
     """Each part's numbers count, and the name, with which the folder begins."""
-    others = [TINY, *(TINY.changed(change) for change in (
+    others = [TINY, *(TINY.with_changes(change) for change in (
         {"vessel": {"contact_impedance": 1e-3}}, {"flow": {"diffusivity": 1e-3}},
         {"target": {"arrivals": {"interval": 0.021}}}, {"schedule": {"pattern": {"frame": 3}}},
         {"instrument": {"current": 0.2}}, {"prior": {"expected_concentration": 24.0}},
@@ -185,13 +185,13 @@ def test_worlds_of_other_numbers_have_other_folders():
 
 def test_worlds_that_differ_in_what_is_read_share_their_episodes():
     """Noise and faults of the instrument, a budget and the prior do not move the fluid."""
-    for change in ({"instrument": {"noise_relative": 0.05, "dead": [1, 1]}},
+    for change in ({"instrument": {"noise_relative": 0.05, "n_dead_range": [1, 1]}},
                    {"prior": {"inflow_std": 0.5}}, {"schedule": {"budget": 2}}):
-        other = TINY.changed(change)
+        other = TINY.with_changes(change)
         assert other != TINY and folder(other) == folder(TINY)
         assert cache.world_digest(other) != cache.world_digest(TINY)
-    assert TINY.fluid.instrument == Instrument(current=TINY.instrument.current)
-    assert TINY.fluid.prior == Prior(TINY.expected_concentration)
+    assert TINY.truth_config.instrument == Instrument(current=TINY.instrument.current)
+    assert TINY.truth_config.prior == Prior(TINY.expected_concentration)
 
 
 def test_keys_depend_on_the_declared_version_and_not_on_the_code(monkeypatch):
@@ -217,8 +217,8 @@ def test_keys_depend_on_the_declared_version_and_not_on_the_code(monkeypatch):
     mine = replace(TINY, flow=Mine())
     first = fresh(mine)
     assert first != fresh(replace(TINY, flow=LaminarFlow()))
-    assert described(mine)["flow"]["kind"] == f"{__name__}.{Mine.__qualname__}"
+    assert config_dict(mine)["flow"]["kind"] == f"{__name__}.{Mine.__qualname__}"
     monkeypatch.setattr(Mine, "simulation_version", 2, raising=False)
     assert fresh(mine) != first
     typed = make_dataclass("LaminarFlow", [], bases=(LaminarFlow,), frozen=True)
-    assert described(typed())["kind"] != described(flows.LaminarFlow())["kind"]
+    assert config_dict(typed())["kind"] != config_dict(flows.LaminarFlow())["kind"]

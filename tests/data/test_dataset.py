@@ -10,10 +10,10 @@ import h5py
 import numpy as np
 import pytest
 import torch
-from eitbench.data import bank
+from eitbench.data import presimulation
+from eitbench.data.episode_cache import cached_episode, integrals, region_operators, score_mass, step_error
 from eitbench.data.episodes import simulate
 from eitbench.data.export import export
-from eitbench.data.recordings import integrals, recording, region_operators, score_mass, step_error
 
 from short import WANDERING
 from tiny_worlds import CHANGES, FAST
@@ -64,7 +64,7 @@ def test_errors_over_a_region_are_those_of_its_scores():
     examples = eitbench.dataset(REGION, "train:0", world=WANDERING)
     world, (example,) = examples.world, examples
     estimate = 30.0 + np.random.default_rng(1).normal(size=example.truth.shape)
-    counted = integrals(world, recording(world, 0))
+    counted = integrals(world, cached_episode(world, 0))
     expected = step_error(score_mass(world), estimate - world.background, *counted)
     np.testing.assert_allclose(examples.errors(example, estimate), expected, rtol=1e-6)
 
@@ -76,7 +76,7 @@ def test_scores_are_the_same_in_few_coordinates(env, changes):
     random = np.random.default_rng(2)
     basis = random.normal(size=(examples.mesh.n_nodes, 3))
     for mean in (25.0, 30.0 + random.normal(size=len(basis))):
-        reduced = examples.reduced(basis, mean)
+        reduced = examples.project(basis, mean)
         (example,) = reduced
         said = random.normal(size=example.truth.shape)
         estimate = reduced.concentration(said)
@@ -95,14 +95,15 @@ def test_modes_are_the_best_basis(env, changes):
     examples = eitbench.dataset(env, "train:0-1", world=changes)
     states = np.concatenate([each.truth[examples.warm_up::2] for each in examples]) - examples.world.background
     squares = np.linalg.eigvalsh(states @ (examples.mass @ states.T))[::-1]        # of the singular values
-    modes = examples.modes(len(states))
+    modes = examples.pod_modes(len(states))
     for q in (1, len(states)):
-        reduced = examples.reduced(modes[:, :q])
+        reduced = examples.project(modes[:, :q])
         np.testing.assert_allclose(reduced.mass, np.eye(q), atol=1e-9)
-        left = sum((reduced.of(each).unresolved - each.unresolved)[examples.warm_up::2].sum() for each in examples)
+        left = sum((reduced.project_example(each).unresolved - each.unresolved)[examples.warm_up::2].sum()
+                   for each in examples)
         assert left == pytest.approx(squares[q:].sum(), rel=1e-5, abs=1e-9 * squares.sum())
     with pytest.raises(ValueError, match=f"q must be at most {len(states)}, .* got {len(states) + 1}"):
-        examples.modes(len(states) + 1)
+        examples.pod_modes(len(states) + 1)
 
 
 @pytest.mark.parametrize("basis, mean, said", [
@@ -112,7 +113,7 @@ def test_bases_that_are_none_are_explained(tiny, basis, mean, said):
     n = tiny.mesh.n_nodes
     basis = np.ones((n, 1)) if basis is None else np.repeat(basis, n, axis=0) if len(basis) == 1 else basis
     with pytest.raises(ValueError, match=said):
-        tiny.reduced(basis, mean)
+        tiny.project(basis, mean)
 
 
 def test_the_flow_is_told_where_it_is_asked_for():
@@ -144,13 +145,13 @@ def test_iterating_simulates_few_at_a_time(monkeypatch, tmp_path):
     """Eight together, and those only that come next: memory is bounded."""
     monkeypatch.setenv("EITBENCH_CACHE", str(tmp_path))
     asked = []
-    simulated = bank.simulate_together
+    simulated = presimulation.simulate_batch
 
     def counting(world, seeds, *more):
         asked.append(list(seeds))
         return simulated(world, seeds, *more)
 
-    monkeypatch.setattr(bank, "simulate_together", counting)
+    monkeypatch.setattr(presimulation, "simulate_batch", counting)
     stream = iter(eitbench.dataset(PIPE, "train:0-8", world=CHANGES))
     assert next(stream).seed == 0 and asked == [list(range(8))]
     assert [example.seed for example in stream] == list(range(1, 9)) and asked[1:] == [[8]]

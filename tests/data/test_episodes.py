@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from eitbench.data import episodes
 from eitbench.data.cache import episode_key, store
-from eitbench.data.episodes import Episode, simulate, truth_discretisation
-from eitbench.data.recordings import recording
+from eitbench.data.episode_cache import cached_episode
+from eitbench.data.episodes import Episode, cached_truth_model, simulate
 from eitbench.worlds.catalogue import PIPE_2D
 from eitbench.worlds.world import Discretisation
 from scipy.stats import kstest
@@ -33,14 +33,14 @@ def test_same_bits_in_this_process_from_the_cache_and_side_by_side(episode, monk
     before = np.random.get_state()[1].copy()  # noqa: NPY002
     assert bits(simulate(TINY, 7, cache=False)) == bits(episode)
     assert (np.random.get_state()[1] == before).all()  # noqa: NPY002
-    together = list(episodes.simulate_together(TINY, [7, 8]))
+    together = list(episodes.simulate_batch(TINY, [7, 8]))
     assert bits(together[0]) == bits(episode)
     assert bits(together[1]) == bits(simulate(TINY, 8, cache=False))
     assert all((mine != theirs).mean() > 0.9 for mine, theirs in zip(episode[:3], together[1][:3], strict=True))
-    (begun,) = episodes.simulate_together(TINY, [7], last=2)
+    (begun,) = episodes.simulate_batch(TINY, [7], last=2)
     assert bits(begun) == bits(Episode(episode.concentration[:3], *(array[:2] for array in episode[1:])))
     first = simulate(TINY, 7)
-    monkeypatch.setattr(episodes, "simulate_together", None)
+    monkeypatch.setattr(episodes, "simulate_batch", None)
     assert bits(simulate(TINY, 7)) == bits(first) == bits(episode)
 
 
@@ -49,7 +49,7 @@ def test_other_processes_same_bits_and_share_one_file(episode, place):
     program = ("from eitbench.worlds.catalogue import PIPE_2D\n"
                "from eitbench.data.episodes import simulate\n"
                "import hashlib\n"
-               f"episode = simulate(PIPE_2D.changed({CHANGES!r}), 7)\n"
+               f"episode = simulate(PIPE_2D.with_changes({CHANGES!r}), 7)\n"
                "print(hashlib.sha256(b''.join(array.tobytes() for array in episode)).hexdigest())")
     running = [subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE, text=True) for _ in range(2)]
     digests = [process.communicate()[0].strip() for process in running]
@@ -70,27 +70,27 @@ def test_no_cache_neither_reads_nor_writes(episode, place):
 @pytest.mark.parametrize("seed", [-1, 1.0, True, "7", None])
 def test_seed_must_be_a_whole_number(seed):
     """Seeds that would be rounded or cast are rejected by name."""
-    for function in (simulate, recording):
+    for function in (simulate, cached_episode):
         with pytest.raises(ValueError, match="seed must be an integer of at least 0"):
             function(TINY, seed)
 
 
 def test_truth_is_finer_than_the_model():
     """No inverse crime: six times the CD nodes, at least twice the EIT unknowns, a quarter of the sub-step."""
-    truth, model = truth_discretisation(PIPE_2D), PIPE_2D.model()
+    truth, model = cached_truth_model(PIPE_2D), PIPE_2D.estimator_model()
     assert model.transport.mesh.n_nodes == 1701
     assert truth.transport.mesh.n_nodes >= 6 * 1701
     assert 3500 <= model.observation.cem.n_unknowns <= 5500
     assert truth.observation.cem.n_unknowns >= 9000
     step = model.transport.time_step
-    assert truth.transport.time_step * PIPE_2D.vessel.parts_of_a_step == PIPE_2D.time_step == step
+    assert truth.transport.time_step * PIPE_2D.vessel.n_truth_steps == PIPE_2D.time_step == step
     fine, coarse = (side.transport.time_step / side.transport.substeps for side in (truth, model))
     assert fine <= coarse / 4
 
 
 def test_resistances_belong_to_the_concentrations(episode):
     """𝓡 at index t − 1 is that of the concentration at t, seen on the truth's EIT mesh."""
-    observation = truth_discretisation(TINY).observation
+    observation = cached_truth_model(TINY).observation
     for t in (1, 5):
         expected = observation.transfer_resistance(episode.concentration[t].astype(float))
         # Concentrations are kept in single precision, resistances as computed.
@@ -112,8 +112,8 @@ def test_noise_is_standard_normal(monkeypatch):
                             inlet=np.array([0]),
                             # the flow takes no part in this
                             time_step=2.5e-3, step=lambda c, *_: c)
-    monkeypatch.setattr(episodes, "truth_discretisation", lambda _: Discretisation(still, electrodes))
-    long = PIPE_2D.changed({"schedule": {"scored_steps": 2982}})
+    monkeypatch.setattr(episodes, "cached_truth_model", lambda _: Discretisation(still, electrodes))
+    long = PIPE_2D.with_changes({"schedule": {"scored_steps": 2982}})
     noise = simulate(long, 5, cache=False).noise
     assert noise.shape == (3000, 16)
     assert abs(noise.mean()) < 4 / np.sqrt(noise.size)

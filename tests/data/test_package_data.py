@@ -7,13 +7,13 @@ from eitbench.bench.package_data import difference, expected_files, unused_files
 from eitbench.bench.tracks import own_ids
 from eitbench.data import cache, episodes
 from eitbench.data.cache import load_shipped
-from eitbench.data.recordings import beginning_file, outline_file, region_file
+from eitbench.data.episode_cache import prefix_file, region_file, scoring_constants_file
 from eitbench.estimation.onboard.models import packed, stored_model_key, unpacked
 from eitbench.estimation.reduced import ReducedModel
 from eitbench.worlds import entry
 
 EXPECTED = expected_files(own_ids())
-CHEAP = {file(entry("eitbench/Pipe2D-v0").world).key for file in (outline_file, beginning_file)}
+CHEAP = {file(entry("eitbench/Pipe2D-v0").world).key for file in (scoring_constants_file, prefix_file)}
 
 
 def test_exactly_the_needed_files_are_shipped():
@@ -44,28 +44,29 @@ def test_models_are_compared_in_one_basis():
 
 
 @pytest.mark.parametrize(("key", "same", "other"), [
-    (lambda world: outline_file(world).key,
+    (lambda world: scoring_constants_file(world).key,
      [{"flow": {"mean_velocity": 4.0}}, {"instrument": {"noise_relative": 0.1}}, {"region": None},
-      {"instrument": {"contact_spread": 0.5, "untold_noise": 2.0}}, {"target": {"reach": [0.0, 0.5]}}],
+      {"instrument": {"contact_impedance_spread": 0.5, "noise_mismatch": 2.0}},
+      {"target": {"radial_range": [0.0, 0.5]}}],
      [{"vessel": {"electrodes_per_wall": 4}}, {"prior": {"expected_concentration": 24.0}},
       {"instrument": {"current": 0.2}}]),
     (lambda world: region_file(world).key,
      [{"schedule": {"scored_steps": 3}}], [{"region": [0.1, 0.2]}, {"vessel": {"electrodes_per_wall": 4}}]),
     (stored_model_key,
-     [{"schedule": {"budget": 3, "scored_steps": 9}}, {"instrument": {"dead": [1, 1]}}],
+     [{"schedule": {"budget": 3, "scored_steps": 9}}, {"instrument": {"n_dead_range": [1, 1]}}],
      [{"instrument": {"noise_relative": 0.1}}, {"prior": {"nodal_std": 0.1}}, {"flow": {"mean_velocity": 4.0}},
       {"schedule": {"time_step": 4e-3}}, {"vessel": {"electrodes_per_wall": 4}}])])
 def test_a_file_belongs_to_its_numbers(key, same, other):
     """Numbers on which it does not depend may differ; no others."""
     world = entry("eitbench/Pipe2DInjectionFlow-v0").world
-    assert all(key(world.changed(change)) == key(world) for change in same)
-    assert all(key(world.changed(change)) != key(world) for change in other)
+    assert all(key(world.with_changes(change)) == key(world) for change in same)
+    assert all(key(world.with_changes(change)) != key(world) for change in other)
 
 
 @pytest.mark.parametrize("id", [id for id in own_ids() if entry(id).world.warm_up])
 def test_the_first_reset_simulates_nothing(id, monkeypatch, tmp_path):
     monkeypatch.setenv(cache.CACHE_VARIABLE, str(tmp_path))
-    monkeypatch.setattr(episodes, "truth_discretisation", None)
+    monkeypatch.setattr(episodes, "cached_truth_model", None)
     kwargs = {"estimator": "none"} if entry(id).track == "injection" else {}
     env = gym.make(id, **kwargs)
     observation, _ = env.reset()

@@ -4,7 +4,7 @@ import warnings
 from itertools import combinations
 
 import pytest
-from eitbench.data.seeds import SPLITS, for_scores, name_seed, parse_seeds, warn_of_reserved
+from eitbench.data.seeds import SPLITS, allow_test_seeds, format_seed, parse_seeds, warn_test_seeds
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -20,16 +20,16 @@ def test_splits_are_disjoint():
 
 @given(st.integers(0, 2**31 - 1))
 def test_names_are_parsed_back(seed):
-    """`parse_seeds` undoes `name_seed` for every seed, inside and outside the splits."""
-    assert parse_seeds(name_seed(seed)) == [seed]
+    """`parse_seeds` undoes `format_seed` for every seed, inside and outside the splits."""
+    assert parse_seeds(format_seed(seed)) == [seed]
 
 
 @given(st.sampled_from(list(SPLITS)), numbers)
 def test_names_are_made_of_what_was_parsed(split, number):
-    """`name_seed` undoes `parse_seeds` within a split, and the seed lies in it."""
+    """`format_seed` undoes `parse_seeds` within a split, and the seed lies in it."""
     (seed,) = parse_seeds(f"{split}:{number}")
     assert seed in SPLITS[split]
-    assert name_seed(seed) == f"{split}:{number}"
+    assert format_seed(seed) == f"{split}:{number}"
 
 
 @given(st.sampled_from(list(SPLITS)), st.lists(st.tuples(numbers, st.integers(0, 20)), min_size=1, max_size=5))
@@ -59,7 +59,7 @@ def test_playing_for_scores_leaves_other_warnings_alone():
     with warnings.catch_warnings(record=True) as said:
         warnings.simplefilter("default")
         for _ in range(2):
-            with for_scores():
-                warn_of_reserved([200_000])
+            with allow_test_seeds():
+                warn_test_seeds([200_000])
             warnings.warn("the cache is full", stacklevel=1)
     assert [str(warning.message) for warning in said] == ["the cache is full"]

@@ -7,7 +7,7 @@ from eitbench.worlds import entries, entry
 from short import short
 
 ESTIMATION = [id for id, each in entries().items() if each.track == "estimation"]
-AT_HOME = [id for id in ESTIMATION if not entry(id).home]
+AT_HOME = [id for id in ESTIMATION if not entry(id).nominal]
 """Without shifts, which are of the same classes and differ in numbers only."""
 PIPE, BIASED = "eitbench/Pipe2D-v0", "eitbench/Pipe2DBiasedVelocity-v0"
 VELOCITY = [id for id in ESTIMATION if entry(id).world.velocity_model is not None]

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from eitbench.data.cache import CACHE_VARIABLE
 from eitbench.data.episodes import Episode
-from eitbench.data.seeds import ReservedSeedWarning, for_scores
+from eitbench.data.seeds import ReservedSeedWarning, allow_test_seeds
 from eitbench.envs.estimation import EstimationEnv
 from eitbench.worlds import Flow, Target, World, entries
 from estimating import ESTIMATION, PIPE, make, noise_actions, play
@@ -59,7 +59,7 @@ def test_world_is_that_of_the_id_but_for_the_changes(name):
     """The lag is the id's, unless another is given."""
     registered = entries()[name]
     env = make(name).unwrapped
-    assert env.world == registered.world.changed(short(name)["world"]) != registered.world
+    assert env.world == registered.world.with_changes(short(name)["world"]) != registered.world
     lag = registered.settings.get("lag", 0)
     assert env.lag == (env.world.n_steps - 1 if lag == "all" else lag)
     assert make(name, lag=1).unwrapped.lag == make(name, lag=1).unwrapped.task.lag == 1
@@ -167,5 +167,5 @@ def test_a_test_episode_is_said_to_be_one():
         warnings.simplefilter("error")
         env.reset(seed=1)
         env.reset(seed=100_000)
-        with for_scores():
+        with allow_test_seeds():
             env.reset(seed=200_000)

@@ -21,7 +21,7 @@ def test_leaderboard_scores_what_is_rewarded(name, said, monkeypatch):
     task = base.task
     step = base.step
     played = []
-    velocity = None if said is None else np.append(said, np.zeros(task.velocity.size - 1))
+    velocity = None if said is None else np.append(said, np.zeros(task.velocity.n_parameters - 1))
     level = np.full(task.mesh.n_nodes, 31.0)
     estimator = SimpleNamespace(update=lambda *_: Estimate(level, velocity=velocity))
 

@@ -6,7 +6,7 @@ import eitbench
 import gymnasium as gym
 import numpy as np
 import pytest
-from eitbench.data.recordings import cycle_voltages, recording, score_operators
+from eitbench.data.episode_cache import cached_episode, cycle_voltages, score_operators
 from eitbench.estimation.onboard.levels import electrode_pairs
 from eitbench.estimation.onboard.reduced_filters import ReducedFilters
 from eitbench.worlds import entries
@@ -89,7 +89,7 @@ def test_voltages_are_those_of_the_pair():
     env = make()
     base = env.unwrapped
     actions = some_pairs()
-    entries = recording(base.world, 3)
+    entries = cached_episode(base.world, 3)
     env.reset(seed=3)
     assert base.error is None
     for t in range(base.world.n_steps):
@@ -111,7 +111,7 @@ def test_first_frame_is_the_worlds_own():
     env = make("reduced")
     observation, _ = env.reset(seed=3)
     played = env.unwrapped.world
-    voltages = cycle_voltages(played, 3, recording(played, 3))
+    voltages = cycle_voltages(played, 3, cached_episode(played, 3))
     np.testing.assert_array_equal(observation["frame"], voltages[:16])
     np.testing.assert_array_equal(observation["voltages"], voltages[15])
     np.testing.assert_array_equal(observation["currents"], played.currents[15])
@@ -233,7 +233,7 @@ def test_frames_change_with_what_is_known(name):
 @pytest.mark.parametrize(("change", "message"), [
     ({"estimator": "exact"}, "estimator must be one of reduced, full, none, got 'exact'"),
     ({"gate": 0.0}, "gate must be"),
-    ({"world": {"instrument": {"limit": "L3"}}}, "limit must be one of L1, L2, Linf"),
+    ({"world": {"instrument": {"current_norm": "L3"}}}, "current_norm must be one of L1, L2, Linf"),
     ({"world": {"colour": 1}}, "world has no 'colour'"),
     ({"render_mode": "tv"}, "render_mode must be"),
 ])

@@ -6,18 +6,18 @@ import eitbench
 import gymnasium as gym
 import numpy as np
 import pytest
-from eitbench.data.bank import fill
 from eitbench.data.cache import CACHE_VARIABLE
-from eitbench.data.recordings import (
+from eitbench.data.episode_cache import (
+    cached_episode,
     cycle_voltages,
     integrals,
     integrate,
     mass_between,
-    outline,
-    recording,
     region_operators,
     score_mass,
+    scoring_constants,
 )
+from eitbench.data.presimulation import presimulate
 from eitbench.envs.injection_core import scaled
 from eitbench.estimation import Filter, linearise_at_reference, velocity_states
 from eitbench.estimation.onboard.belief import Belief
@@ -58,7 +58,7 @@ def test_errors_are_those_in_the_region(estimator):
     env.reset(seed=3)
     world = base.world
     truth = eitbench.simulate(world, 3).concentration.astype(float)
-    mesh = world.truth().transport.mesh
+    mesh = world.truth_model().transport.mesh
     onto = base.task.mesh.interpolation_to(mesh.points)
     level = np.full(onto.shape[1], filter_of(base).concentration[0])
     paid = 0
@@ -81,10 +81,10 @@ def test_errors_are_those_in_the_region(estimator):
 def test_without_a_region_all_counts(env):
     """Then integrals are the recording's own, to the bit; and over all cells both mass matrices are the same."""
     whole = dataclasses.replace(env.world, region=None)
-    entries = recording(whole, 3)
+    entries = cached_episode(whole, 3)
     for name, array in integrals(whole, entries)._asdict().items():
         np.testing.assert_array_equal(array, entries[name])
-    assert score_mass(whole) is outline(whole).mass
+    assert score_mass(whole) is scoring_constants(whole).mass
     mesh = make_task(whole).mesh
     expected = mass_matrix(mesh).toarray()
     everywhere = mass_between(mesh, 0.0, 0.4).toarray()
@@ -98,10 +98,10 @@ def test_recordings_hold_the_integrals(monkeypatch, tmp_path):
     """With the bits that the truth gives."""
     monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path))
     narrow = {"flow": {"velocity_range": [44.5, 45.5]}, "schedule": {"scored_steps": 3}}
-    world = PIPE_2D_DRIFTING.changed(WANDERING).changed(narrow)
-    assert fill(world, [1, 2]) == 2
+    world = PIPE_2D_DRIFTING.with_changes(WANDERING).with_changes(narrow)
+    assert presimulate(world, [1, 2]) == 2
     made = integrate(eitbench.simulate(world, 2, cache=False), world.background, *region_operators(world))
-    for one, other in zip(integrals(world, recording(world, 2)), made, strict=True):
+    for one, other in zip(integrals(world, cached_episode(world, 2)), made, strict=True):
         np.testing.assert_array_equal(one, other)
 
 
@@ -109,7 +109,7 @@ def test_recordings_hold_the_integrals(monkeypatch, tmp_path):
     ({"region": [0.3, 0.2]}, "region must be a range"),
     ({"region": [0.283, 0.4]}, "multiples of 0.01 m"),
     ({"flow": {"velocity_walk": 0.0}}, "velocity_walk must be"),
-    ({"flow": {"swing_range": [0.0, 0.2]}}, "world.flow has no 'swing_range'; there are mean_vel"),
+    ({"flow": {"oscillation_range": [0.0, 0.2]}}, "world.flow has no 'oscillation_range'; there are mean_vel"),
 ])
 @pytest.mark.filterwarnings("ignore")
 def test_wrong_arguments_are_named(change, message):
@@ -120,11 +120,11 @@ def test_wrong_arguments_are_named(change, message):
 
 def test_velocity_is_a_walk_that_turns_back():
     """Up or down by the same step, within its range, all of which it reaches; other seeds, other walks."""
-    world = PIPE_2D_DRIFTING.changed({"flow": {"velocity_range": [4.0, 5.0]}, "schedule": {"scored_steps": 400}})
+    world = PIPE_2D_DRIFTING.with_changes({"flow": {"velocity_range": [4.0, 5.0]}, "schedule": {"scored_steps": 400}})
     walks = []
     for seed in range(3):
         flow = world.flow.draw(world, np.random.default_rng(seed))
-        centre = np.array([flow(t).mean_velocity for t in range(1 - world.lead_in, world.n_steps + 1)])
+        centre = np.array([flow(t).mean_velocity for t in range(1 - world.spin_up_steps, world.n_steps + 1)])
         np.testing.assert_allclose(np.abs(np.diff(centre)), WALK, rtol=1e-9)
         assert centre.min() == pytest.approx(4.0)
         assert centre.max() == pytest.approx(5.0)
@@ -150,7 +150,7 @@ def test_tables_hold_between_their_velocities(env):
     state = np.zeros(len(slope))
     state[:20] = np.random.default_rng(0).normal(size=20)
     nodes = model.basis @ state
-    moved = transport.velocity_derivatives(nodes, nodes[transport.inlet], 0.0, task.velocity.directions)[1][:, 0]
+    moved = transport.velocity_derivatives(nodes, nodes[transport.inlet], 0.0, task.velocity.basis_fields)[1][:, 0]
     exact = weighted.T @ moved
     assert np.linalg.norm(slope @ state - exact) < 2e-2 * np.linalg.norm(exact)
 
@@ -165,7 +165,7 @@ def test_full_operator_is_the_joint_filter_of_the_baselines():
     env.reset(seed=5)
     level = filter_of(env).concentration[0]
     filter_ = Filter(velocity_states(task, level, BOUNDS), linearise_at_reference(task, level))
-    for t, voltages in enumerate(cycle_voltages(world, 5, recording(world, 5))):
+    for t, voltages in enumerate(cycle_voltages(world, 5, cached_episode(world, 5))):
         current = world.currents[t % 16]
         filter_.assimilate(voltages, current)
         if t < 16:

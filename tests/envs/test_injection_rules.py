@@ -14,7 +14,7 @@ from choosing import BUDGET, CURRENTS, FAULTS, make, play, some_pairs
 @pytest.mark.parametrize(("limit", "order"), [("L1", 1), ("L2", 2), ("Linf", np.inf)])
 def test_currents_are_projected(limit, order):
     """They sum to zero; those within the limit are only centred, others scaled onto a pair's norm."""
-    rules = Rules(PIPE_2D.changed({"instrument": {"limit": limit}}))
+    rules = Rules(PIPE_2D.with_changes({"instrument": {"current_norm": limit}}))
     assert rules.limit == limit
     free = np.random.default_rng(0).uniform(-1.0, 1.0, (50, 16))
     free *= np.geomspace(0.01, 1.0, 50)[:, None]
@@ -68,12 +68,12 @@ def test_budget_is_spent_and_then_nothing_flows():
 
 def test_dead_electrodes_read_nothing_and_carry_nothing():
     """A broken wire reads interference; what would have to pass it does not flow; all else is 𝓡 I."""
-    instrument = Instrument(dead=(3, 3), failing=(2, 2), loose=(2, 2), interference=0.5)
+    instrument = Instrument(n_dead_range=(3, 3), n_failing_range=(2, 2), n_loose_range=(2, 2), interference=0.5)
     noise = instrument.noise
     assert noise == PIPE_2D.noise
     rng = np.random.default_rng(0)
     faults = instrument.draw(rng, 16, 50)
-    broken = faults.broken_from
+    broken = faults.open_circuit_from
     assert (broken == 0).sum() == 3
     assert ((broken > 0) & (broken <= 50)).sum() == 2
     assert (faults.resistance > 0).sum() == 2
@@ -122,17 +122,17 @@ def test_a_floor_adds_to_the_noise():
     std = np.hypot(instrument.noise.std(clean), 2e-3)
     np.testing.assert_allclose(read, clean + std * draws, rtol=1e-12)
     np.testing.assert_allclose(read[2], 2e-3 * draws[2], rtol=1e-12)
-    np.testing.assert_allclose(instrument.believed_noise.std(clean), std, rtol=1e-12)
+    np.testing.assert_allclose(instrument.model_noise.std(clean), std, rtol=1e-12)
 
 
 def test_faults_depend_on_the_seed_alone_and_are_shown_by_doubt():
     """The same seed has the same faults; electrodes in doubt after a while are those with a fault."""
-    faults = {"dead": [3, 3], "failing": [0, 0], "loose": [0, 0]}
+    faults = {"n_dead_range": [3, 3], "n_failing_range": [0, 0], "n_loose_range": [0, 0]}
     longer = {"instrument": faults, "schedule": {"scored_steps": 24}}
     env = make("reduced", FAULTS, longer=longer)
     base = env.unwrapped
     steps = play(env, 4, some_pairs())
-    broken = np.flatnonzero(base.core.faults.broken_from[0] == 0)
+    broken = np.flatnonzero(base.core.faults.open_circuit_from[0] == 0)
     again = play(env, 4, some_pairs())
     for (one, *_), (other, *_) in zip(steps, again, strict=True):
         np.testing.assert_array_equal(one["voltages"], other["voltages"])
@@ -141,14 +141,14 @@ def test_faults_depend_on_the_seed_alone_and_are_shown_by_doubt():
     assert len(broken) == 3
     assert doubt[broken].mean() > 0.3
     env.reset(seed=5)
-    assert set(np.flatnonzero(base.core.faults.broken_from[0] == 0)) != set(broken)
+    assert set(np.flatnonzero(base.core.faults.open_circuit_from[0] == 0)) != set(broken)
 
 
 @pytest.mark.parametrize(("name", "change", "message"), [
-    (FAULTS, {"instrument": {"dead": [3, 2]}}, "dead must be a range least ≤ most"),
-    (FAULTS, {"instrument": {"loose": [0, 12]}},
+    (FAULTS, {"instrument": {"n_dead_range": [3, 2]}}, "n_dead_range must be a range least ≤ most"),
+    (FAULTS, {"instrument": {"n_loose_range": [0, 12]}},
      "must leave two electrodes sound, got up to 18 of 16"),
-    (FAULTS, {"instrument": {"loose": "01"}}, r"loose must be a range \(least, most\), got '01'"),
+    (FAULTS, {"instrument": {"n_loose_range": "01"}}, r"n_loose_range must be a range \(least, most\), got '01'"),
     (BUDGET, {"schedule": {"budget": -1}}, "budget must be"),
 ])
 def test_wrong_rules_are_named(name, change, message):
@@ -162,7 +162,7 @@ def test_wrong_rules_are_named(name, change, message):
 def test_the_largest_currents_are_those_at_the_bounds(kind, limit):
     """Whatever is finite is injected within the instrument's limit; nothing overflows."""
     largest = np.finfo(kind).max
-    longer = {"instrument": {"limit": limit}}
+    longer = {"instrument": {"current_norm": limit}}
     env, other = (make("reduced", CURRENTS, longer=longer).unwrapped for _ in range(2))
     signs = np.random.default_rng(3).choice([-1.0, 1.0], (env.core.length, 16))
     env.reset(seed=1)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from eitbench import make_task
-from eitbench.data.recordings import score_mass
+from eitbench.data.episode_cache import score_mass
 from eitbench.estimation import inflow_filter
 from eitbench.estimation.inflow_response import steady_response
 from eitbench.estimation.onboard.belief import Belief

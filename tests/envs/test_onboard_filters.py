@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from eitbench import make_task
-from eitbench.data.recordings import cycle_voltages, recording
+from eitbench.data.episode_cache import cached_episode, cycle_voltages
 from eitbench.estimation import CalibrationFrame, LinearisedForwardModel, kalman_filter, table_5_1_filter
 from eitbench.estimation.onboard.levels import electrode_pairs
 
@@ -22,7 +22,7 @@ def test_reduced_one_is_close_to_the_baselines():
     env = make("reduced")
     world = env.unwrapped.world
     task = make_task(world)
-    voltages = cycle_voltages(world, 5, recording(world, 5))
+    voltages = cycle_voltages(world, 5, cached_episode(world, 5))
     first = CalibrationFrame(task)
     for k in range(16):
         first.add(voltages[k], world.currents[k])
@@ -45,7 +45,7 @@ def test_full_one_is_that_of_the_baselines():
     world = env.unwrapped.world
     task = env.unwrapped.task
     core = env.unwrapped.core
-    voltages = cycle_voltages(world, 5, recording(world, 5))
+    voltages = cycle_voltages(world, 5, cached_episode(world, 5))
     env.reset(seed=5)
     start = table_5_1_filter(task.transport, task.prior, filter_of(env).concentration[0])
     linear = LinearisedForwardModel(task.observation, task.noise, start.mean)

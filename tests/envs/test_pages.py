@@ -32,7 +32,7 @@ def test_sections_and_sizes(described):
     assert re.findall(r"^## (.*)$", text, re.MULTILINE) == [
         "Description", "Action Space", "Observation Space", "Rewards", "Starting State", "Episode End",
         "Arguments", "World"]
-    assert section(text, "Description").startswith(entries()[id].about.strip())
+    assert section(text, "Description").startswith(entries()[id].description.strip())
     sizes = table(section(text, "Description"))
     world = env.world
     assert str(env.action_space.shape) in sizes["action space"] or f"({env.action_space.n})" in sizes["action space"]

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from eitbench import scoring
-from eitbench.data.recordings import score_operators
+from eitbench.data.episode_cache import score_operators
 from estimating import AT_HOME, VELOCITY, best_velocity, make
 
 each_velocity = pytest.mark.parametrize("name", VELOCITY)
@@ -21,7 +21,7 @@ def test_action_is_one_number_a_node_and_one_a_parameter_of_the_flow(name):
     task = env.unwrapped.task
     n = task.mesh.n_nodes
     velocity = env.unwrapped.world.velocity_model
-    k = 0 if velocity is None else velocity.size
+    k = 0 if velocity is None else velocity.n_parameters
     assert task.velocity == velocity
     assert env.unwrapped.n_nodes == n
     assert env.action_space.shape == (n + k,)
@@ -90,7 +90,7 @@ def test_reward_has_a_second_term_for_the_flow(name):
     squared = (true**2 @ model.weights)[scored]
     np.testing.assert_allclose(terms["none"], 1.0, atol=1e-7)
     # no combination of three profiles is the skewed truth
-    limit = 2e-4 if model.size > 1 else 1e-7
+    limit = 2e-4 if model.n_parameters > 1 else 1e-7
     assert (terms["best"] < limit).all()
     assert (terms["best"] > -1e-7).all()
     np.testing.assert_allclose(terms["twice"], 1.0, atol=limit + 1e-7)

@@ -20,7 +20,7 @@ from short import PLAIN, short
 
 LAGS = [name for name in PLAIN if name in ESTIMATION]
 """The plain pipe with its three lags; what does not depend on the world is tested on these."""
-TINY = PIPE_2D.changed(CHANGES)
+TINY = PIPE_2D.with_changes(CHANGES)
 """Seven measurements, of which five are scored."""
 
 
@@ -252,7 +252,7 @@ def test_seeds_that_would_be_cast_are_refused(seed):
 @pytest.mark.parametrize("change", [{"num_envs": 0}, {"episodes": 0}, {"lag": 99}, {"lag": "x"}])
 def test_wrong_arguments_are_named_before_anything_is_computed(change, monkeypatch):
     """No mesh is built to find out that lag is wrong."""
-    monkeypatch.setattr(estimation, "outline", None)
+    monkeypatch.setattr(estimation, "scoring_constants", None)
     asked = {"num_envs": 2, "world": {"flow": {"mean_velocity": 44.0}}} | change
     with pytest.raises(ValueError, match=f"{next(iter(change))} must be"):
         gym.make_vec(PIPE, **asked)

@@ -138,7 +138,7 @@ def pipe(steps=5):
     """
     c_bh = 30.0
     rng = np.random.default_rng(11)
-    transport, observation = PIPE_2D.model()
+    transport, observation = PIPE_2D.estimator_model()
     evolution = transport.evolution_model()
     F, Y, H = evolution
     n, m = len(F), Y.shape[1]

@@ -6,7 +6,7 @@ from functools import lru_cache
 import numpy as np
 import pytest
 from eitbench.bench.methods import baseline_folder
-from eitbench.data.episodes import simulate, truth_discretisation
+from eitbench.data.episodes import cached_truth_model, simulate
 from eitbench.data.seeds import parse_seeds
 from eitbench.estimation import (
     Filter,
@@ -69,7 +69,8 @@ def stepped(inflow, lag=0):
 
 def test_a_flow_that_changes_carries_each_inflow_by_what_flowed_then():
     """Inflows carried on step by step, each step by its own transport; before the first it was as in it."""
-    nominal, faster = (make_task(TINY.changed({"flow": {"mean_velocity": speed}})).transport for speed in (45.0, 60.0))
+    nominal, faster = (make_task(TINY.with_changes({"flow": {"mean_velocity": speed}})).transport
+                       for speed in (45.0, 60.0))
     transports = [nominal, faster, nominal]
     response = time_varying_responses(lambda t: transports[t - 1], 3)[-1]
     K, inlet = response.weights.shape[1:]
@@ -194,15 +195,15 @@ def test_a_correlation_is_one():
 def test_inflows_are_those_of_the_simulation():
     """At the truth's inlet, where its nodes are the model's too."""
     sampled = TINY.sample_inflow(3)
-    assert sampled.shape == (TINY.lead_in + TINY.n_steps + 1, 21)
-    truth = truth_discretisation(TINY).transport
+    assert sampled.shape == (TINY.spin_up_steps + TINY.n_steps + 1, 21)
+    truth = cached_truth_model(TINY).transport
     fine = truth.mesh.points[truth.inlet][:, 1]
     coarse = task().mesh.points[task().transport.inlet][:, 1]
     same = [(i, k) for i, y in enumerate(coarse) for k, z in enumerate(fine) if abs(y - z) < 1e-9]
     assert len(same) > 5
     here, there = map(list, zip(*same, strict=True))
     simulated = simulate(TINY, 3).concentration[:, truth.inlet]
-    np.testing.assert_allclose(sampled[TINY.lead_in:, here], simulated[:, there], rtol=1e-6)
+    np.testing.assert_allclose(sampled[TINY.spin_up_steps:, here], simulated[:, there], rtol=1e-6)
 
 
 def test_learns_from_train_alone():
@@ -227,7 +228,7 @@ def test_an_inlet_that_hardly_differs_is_the_same():
     """Behind the obstacle's inlet, whose nodes lie nanometres beside the straight pipe's; not those of half a pipe."""
     shipped = InflowPrior.load(baseline_folder() / "priors" / "pipe2d-logarithm.json")
     assert shipped.matches_task(make_task(PIPE_2D_OBSTACLE))
-    narrow = TINY.changed({"vessel": {"half_width": 0.04}})
+    narrow = TINY.with_changes({"vessel": {"half_width": 0.04}})
     assert not shipped.matches_task(make_task(narrow))
 
 

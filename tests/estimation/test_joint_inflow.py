@@ -176,7 +176,7 @@ def test_flows_of_a_task():
 def test_what_does_not_fit_is_told():
     with pytest.raises(ValueError, match="task must ask for the flow"):
         task_velocity_prior(task())
-    with pytest.raises(ValueError, match="task must have a flow, got AtRest"):
+    with pytest.raises(ValueError, match="task must have a flow, got StationaryTransport"):
         scaled_velocity_prior(make_task(STATIONARY_TANK_2D), 0.3, 0.0)
     with pytest.raises(ValueError, match="walk_std"):
         flow(walk=(0.1,))

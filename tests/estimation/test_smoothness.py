@@ -8,7 +8,7 @@ import pytest
 from eitbench.estimation import LinearisedForwardModel, nodal_filter, smoothness_covariance
 from eitbench.numerics.fem import mass_matrix, stiffness_matrix
 from eitbench.numerics.mesh import rectangle_mesh
-from eitbench.numerics.round import uniform_disc
+from eitbench.numerics.round_meshes import uniform_disc
 from eitbench.worlds.bodies import disc_indicator
 from eitbench.worlds.catalogue import STATIONARY_TANK_2D
 from eitbench.worlds.task import make_task

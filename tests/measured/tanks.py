@@ -22,7 +22,7 @@ def instrument(n_electrodes=8):
     return 1e-3 * pairs, pairs
 
 
-TANK = RoundTank(radius=0.1, n_electrodes=8, electrode_cover=0.4).electrode_model(True).with_contacts(CONTACTS)
+TANK = RoundTank(radius=0.1, n_electrodes=8, electrode_coverage=0.4).electrode_model(True).with_contacts(CONTACTS)
 
 
 @cache

@@ -15,7 +15,7 @@ from eitbench.estimation.walk import RandomWalk
 from eitbench.measured import Measurements
 from eitbench.measured.model import MeasurementModel
 from eitbench.numerics.fem import mass_matrix
-from eitbench.physics.rest import AtRest
+from eitbench.physics.stationary import StationaryTransport
 from gymnasium.utils.env_checker import check_env
 from tanks import FIXED_STDS, PIPE, VESSEL, simulate_measurements, stationary
 
@@ -100,7 +100,7 @@ def test_repeated_injections_in_a_frame_are_not_motion(measurements):
     rows = [*range(8), 2, 5]
     frame = replace(measurements, injection_index=measurements.injection_index[rows],
                     voltages=measurements.voltages[rows], times=0.01 * np.arange(10))
-    assert isinstance(MeasuredEnv(frame, VESSEL, initial_std=0.2).task.transport, AtRest)
+    assert isinstance(MeasuredEnv(frame, VESSEL, initial_std=0.2).task.transport, StationaryTransport)
 
 
 @pytest.mark.parametrize(("changes", "message"), [

@@ -6,13 +6,13 @@ from eitbench.measured.vessel import read_vessel
 from eitbench.worlds.vessels import RoundTank
 from tanks import CYLINDER, PIPE, VESSEL
 
-TANK = RoundTank(radius=0.1, n_electrodes=8, electrode_cover=0.4)
+TANK = RoundTank(radius=0.1, n_electrodes=8, electrode_coverage=0.4)
 
 
 def test_a_yaml_file_equals_a_mapping(tmp_path):
     path = tmp_path / "vessel.yml"
     path.write_text("kind: circle\nradius: 0.1\nelectrodes: 8\ncover: 0.4\n", encoding="utf-8")
-    np.testing.assert_array_equal(read_vessel(path).transport_mesh().points, TANK.carrier(fine=False)[0].points)
+    np.testing.assert_array_equal(read_vessel(path).transport_mesh().points, TANK.transport_mesh(fine=False)[0].points)
     path.write_text("- a\n", encoding="utf-8")
     with pytest.raises(ValueError, match="vessel must be a YAML file"):
         read_vessel(path)

@@ -6,9 +6,9 @@ import math
 import numpy as np
 import pytest
 from eitbench.numerics.fem import mass_matrix
-from eitbench.numerics.round import uniform_disc
+from eitbench.numerics.round_meshes import uniform_disc
 from eitbench.physics.flow import PlaneChannelFlow, PlugFlow, PowerLawFlow, RoundPipeFlow
-from eitbench.physics.profiles import SkewedChannelFlow, VelocityModel, parabola
+from eitbench.physics.profiles import SkewedChannelFlow, VelocityModel, parabolic_model
 from eitbench.worlds.catalogue import PIPE_2D_SKEWED
 
 R = 0.05
@@ -123,7 +123,7 @@ def test_without_skewness_it_is_the_plane_channel_flow():
 
 @pytest.mark.parametrize(("flow", "point", "velocity"), [
     (PlaneChannelFlow(1.0, 2.0), [0, 1], [1.125, 0.0]), (SkewedChannelFlow(1.0, 2.0), [0, 1], [1.125, 0.0]),
-    (parabola(2.0, 1.0, 1.0, 0.0).field([1.0]), [0, 1], [1.125, 0.0]),
+    (parabolic_model(2.0, 1.0, 1.0, 0.0).field([1.0]), [0, 1], [1.125, 0.0]),
     (PowerLawFlow(1.0, 2.0, 0.5), [0, 1], [1.5 * np.sqrt(0.5), 0.0]), (PlugFlow(0.5), [0, 1], [0.5, 0.0]),
     (RoundPipeFlow(1.0, 2.0), [0, 1, 0], [0.0, 0.0, 1.5])], ids=lambda value: type(value).__name__)
 def test_integer_points_are_taken_as_numbers(flow, point, velocity):
@@ -149,21 +149,21 @@ def test_profiles_are_those_of_the_directions():
     by_hand = np.stack([1.5 - 1.5 * eta**2, 2.0 * eta, 0.5 + 0.25 * eta - 0.75 * eta**3], axis=1)
     np.testing.assert_allclose(MODEL.profiles, by_hand, rtol=1e-12, atol=1e-15)
     at = np.column_stack([np.full(24, 0.2), MODEL.points])
-    for profile, direction in zip(MODEL.profiles.T, MODEL.directions, strict=True):
+    for profile, direction in zip(MODEL.profiles.T, MODEL.basis_fields, strict=True):
         np.testing.assert_allclose(direction(at), np.column_stack([profile, np.zeros(24)]), rtol=1e-12, atol=1e-15)
-    assert len(MODEL.directions) == MODEL.size == MODEL.profiles.shape[1] == 3
+    assert len(MODEL.basis_fields) == MODEL.n_parameters == MODEL.profiles.shape[1] == 3
 
 
 def test_field_is_the_sum_of_its_directions():
     """v = Σ θ_k φ_k anywhere in the channel, whatever the degrees of the φ_k."""
     theta = np.array([4.0, -1.5, 0.7])
-    total = sum(value * direction(POINTS) for value, direction in zip(theta, MODEL.directions, strict=True))
+    total = sum(value * direction(POINTS) for value, direction in zip(theta, MODEL.basis_fields, strict=True))
     np.testing.assert_allclose(MODEL.field(theta)(POINTS), total, rtol=1e-12, atol=1e-14)
 
 
 def test_parabola_is_the_plane_channel_flow_of_its_mean():
     """Its one parameter is the mean velocity."""
-    model = parabola(R, 4.5, 1.0, 0.02)
+    model = parabolic_model(R, 4.5, 1.0, 0.02)
     np.testing.assert_allclose(model.field([3.7])(POINTS), PlaneChannelFlow(3.7, R)(POINTS), rtol=1e-12)
     assert (model.nominal, model.initial_std, model.walk_std) == ((4.5,), (1.0,), (0.02,))
 
@@ -193,7 +193,7 @@ def test_basis_of_the_skewed_pipe_holds_its_truth_well_but_not_exactly(k):
 def test_skewed_basis_rests_on_the_walls_and_only_the_first_carries_fluid():
     """φ_k(±1) = 0; the mean of the parabola is 1, that of the others 0, so that θ_1 is the mean velocity."""
     model = PIPE_2D_SKEWED.velocity_model
-    for direction in model.directions:
+    for direction in model.basis_fields:
         np.testing.assert_allclose(direction(np.array([[0.1, -R], [0.2, R]])), 0.0, atol=1e-14)
     np.testing.assert_allclose(model.weights @ model.profiles / (2.0 * R), [1.0, 0.0, 0.0], atol=1e-14)
 

@@ -52,7 +52,7 @@ def test_derivative_of_the_law(law):
     (lambda: LinearConductivity(0.0), "molar_conductivity"),
     (lambda: LinearConductivity(np.nan), "molar_conductivity"),
     (lambda: VoltageNoise(relative=-0.01), "relative"),
-    (lambda: VoltageNoise(of_largest=np.inf), "of_largest"),
+    (lambda: VoltageNoise(relative_to_max=np.inf), "relative_to_max"),
     (lambda: VoltageNoise(floor="low"), "floor")])
 def test_wrong_parameters_are_refused(make, match):
     """The message names the parameter."""
@@ -125,7 +125,7 @@ def test_wrong_concentrations_are_refused():
                      lambda c: model.linearise(c, PATTERNS)):
             with pytest.raises(ValueError, match="concentration must"):
                 call(bad)
-    with pytest.raises(ValueError, match="smallest_concentration must be"):
+    with pytest.raises(ValueError, match="min_concentration must be"):
         ObservationModel(model.cem, model.interpolation, LAWS[0], 0.0)
 
 

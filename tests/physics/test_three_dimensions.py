@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from eitbench.numerics.fem import mass_matrix
 from eitbench.numerics.mesh import Mesh
-from eitbench.numerics.round import extrude, uniform_disc
+from eitbench.numerics.round_meshes import extrude, uniform_disc
 from eitbench.physics.cem import CompleteElectrodeModel
 from eitbench.physics.flow import RoundPipeFlow
 from eitbench.physics.transport import ConvectionDiffusion

@@ -13,7 +13,7 @@ from eitbench.bench.run import Job, run_jobs
 from eitbench.bench.store import EpisodeStore
 from eitbench.bench.tracks import Environment
 from eitbench.data.cache import CACHE_VARIABLE
-from eitbench.numerics.round import extrude, uniform_disc
+from eitbench.numerics.round_meshes import extrude, uniform_disc
 from eitbench.report import charts, page
 from eitbench.report.boards import run_leaderboards
 from eitbench.report.sweep import sweeps

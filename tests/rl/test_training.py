@@ -105,8 +105,8 @@ def test_an_agent_acts_as_it_was_evaluated(run):
     assert agent.name == f"{algo}_{mark}_seed1" and mark == configuration_hash(asked | {"seed": 2})
     assert mark != configuration_hash(asked | {"kwargs": {}})
     assert not agent.privileged and agent.parameters["env"] == env
-    other = {"instrument": {"limit": None if env == CURRENTS else "L1"}}
-    assert not agent.suits(Rules(PIPE_2D.changed(other)))
+    other = {"instrument": {"current_norm": None if env == CURRENTS else "L1"}}
+    assert not agent.suits(Rules(PIPE_2D.with_changes(other)))
     if algo == "ppo":
         chosen = [injected_currents(agent, env, kwargs, estimator) for estimator in ("reduced", "full")]
         np.testing.assert_array_equal(*chosen)

@@ -11,10 +11,10 @@ import pytest
 from eitbench.bench.methods import load_method
 from eitbench.bench.text import seed_ranges
 from eitbench.data.cache import CACHE_VARIABLE
-from eitbench.data.seeds import name_seed
+from eitbench.data.seeds import format_seed
 from eitbench.envs.estimation import EstimationEnv
 from eitbench.estimation import CalibrationFrame, initial_covariance
-from eitbench.physics.rest import AtRest
+from eitbench.physics.stationary import StationaryTransport
 from eitbench.worlds import entry
 from eitbench.worlds.flows import FlowPastBulge, _past_bulge
 from eitbench.worlds.task import Estimate
@@ -53,7 +53,7 @@ def perfect(env, name, seed):
     if name in ("homogeneous", "gauss_newton"):
         return constant(env, name, seed)
     states = env.truth_mesh().interpolation_to(task.mesh.points) @ env.truth().T
-    if isinstance(task.transport, AtRest):    # the cylinders need one maximum each
+    if isinstance(task.transport, StationaryTransport):    # the cylinders need one maximum each
         smooth = initial_covariance(task.mesh, task.prior)
         states = 30.0 + smooth @ (states - 30.0) / smooth.sum(axis=1, keepdims=True)
     if name in ("kalman_filter", "filter_bank") and task.velocity is not None:
@@ -62,7 +62,7 @@ def perfect(env, name, seed):
     if task.velocity is not None:
         root = np.sqrt(task.velocity.weights)[:, None]
         parameters = np.linalg.lstsq(root * task.velocity.profiles, root * env.true_velocity().T, rcond=None)[0].T
-        variance = np.full(task.velocity.size, 0.01)
+        variance = np.full(task.velocity.n_parameters, 0.01)
     return [Estimate(state, np.full(len(state), 2.0 if "filter" in name else 1.0),
                      velocity=None if parameters is None else parameters[t],
                      velocity_variance=variance)
@@ -191,7 +191,7 @@ def test_injection_is_drawn(monkeypatch, run_cache, tmp_path):
                               for k in range(3)])
 
     monkeypatch.setattr(injection, "run_jobs", lambda jobs, *_, **__: run_seeds.update({
-        jobs[0].environment: seed_ranges(list(dict.fromkeys(name_seed(job.seed)
+        jobs[0].environment: seed_ranges(list(dict.fromkeys(format_seed(job.seed)
                                                             for job in jobs)))}))
     monkeypatch.setattr(injection, "policy_rows", rows)
     monkeypatch.setattr(injection, "results_in", lambda folder: [])
@@ -200,7 +200,7 @@ def test_injection_is_drawn(monkeypatch, run_cache, tmp_path):
     path, description = FIGURES["injection"](None, 1, tmp_path / "new")
     picture = imread(path)
     assert min(picture.shape[:2]) > 250 and picture[..., :3].std() > 0.05
-    assert list(run_seeds.items()) == [((env, "{}"), entry(env).seeds) for env in injection.WORLDS]
+    assert list(run_seeds.items()) == [((env, "{}"), entry(env).test_seeds) for env in injection.WORLDS]
     assert description.count("best_pair ") == 6
     with Image.open(tmp_path / "new" / "injection.gif") as animation:
         assert animation.n_frames == 4                        # the first frame of 16, then four steps
@@ -208,5 +208,5 @@ def test_injection_is_drawn(monkeypatch, run_cache, tmp_path):
 
 def test_thesis_figures_show_dev_episodes_by_default(monkeypatch, tmp_path):
     """Test episodes are never drawn by default."""
-    monkeypatch.setattr(pipe2d, "fig5_4", lambda seeds, jobs, out: (out, " ".join(map(name_seed, seeds))))
+    monkeypatch.setattr(pipe2d, "fig5_4", lambda seeds, jobs, out: (out, " ".join(map(format_seed, seeds))))
     assert FIGURES["fig5.4"](None, 1, tmp_path)[1] == "dev:0 dev:1"

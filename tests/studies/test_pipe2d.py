@@ -14,7 +14,7 @@ from eitbench import make_task, simulate
 from eitbench.bench.methods import load_method
 from eitbench.bench.run import Job, run_episode
 from eitbench.bench.tracks import Environment
-from eitbench.data.recordings import score_operators
+from eitbench.data.episode_cache import score_operators
 from eitbench.data.seeds import parse_seeds
 from eitbench.estimation import best_homogeneous, gauss_newton
 from eitbench.numerics.fem import stiffness_matrix

@@ -12,7 +12,7 @@ from eitbench.bench.run import Job, run_episode
 from eitbench.bench.tracks import Environment
 from eitbench.data.seeds import parse_seeds
 from eitbench.scoring import deficit_centre
-from eitbench.worlds.streams import randomness
+from eitbench.worlds.random_streams import episode_streams
 
 SEED = parse_seeds("dev:0")[0]
 
@@ -116,7 +116,7 @@ def test_disc_is_tracked_with_one_pair_of_electrodes():
     env = environment("RotatingTank2D")
     world, points = env.world, env.task.mesh.points
     disc = world.target
-    path = disc.path(world, randomness(SEED).flow)[1:]
+    path = disc.path(world, episode_streams(SEED).flow)[1:]
     weights = np.ones(len(points))
 
     def distance(baseline):

@@ -5,12 +5,12 @@ import hashlib
 import gymnasium as gym
 import numpy as np
 import pytest
-from eitbench.numerics.round import electrode_disc
+from eitbench.numerics.round_meshes import electrode_disc
 from eitbench.physics.cem import CompleteElectrodeModel
 from eitbench.worlds import World, register
 from eitbench.worlds.bodies import Cylinders
 from eitbench.worlds.flows import NoFlow
-from eitbench.worlds.schedule import AroundTheTank, Schedule
+from eitbench.worlds.schedule import Schedule, TankOppositeDiagonalPattern
 from eitbench.worlds.vessels import MeshVessel, RoundTank
 
 from shapes import write_mesh
@@ -53,18 +53,18 @@ def test_electrodes_are_those_of_the_groups(files, vessel):
         sigma = 0.3 + 0.1 * np.sin(40.0 * mesh.points[:, 0])
         np.testing.assert_array_equal(vessel.electrode_model(fine).transfer_resistance(sigma),
                                       direct.transfer_resistance(sigma))
-        np.testing.assert_array_equal(vessel.carrier(fine)[0].points, mesh.points)
+        np.testing.assert_array_equal(vessel.transport_mesh(fine)[0].points, mesh.points)
 
 
 def test_a_world_of_it_is_played(vessel, monkeypatch):
     """Registered by a script it plays as any other; no inlet, so that nothing flows in."""
     register_apart(monkeypatch)
     world = World("Meshed", vessel, NoFlow(), Cylinders(), schedule=Schedule(
-        time_step=0.02, scored_steps=4, pattern=AroundTheTank(), warm_up=0, calibration=1))
+        time_step=0.02, scored_steps=4, pattern=TankOppositeDiagonalPattern(), warm_up=0, calibration=1))
     register(world, "test/Meshed-v0")
     env = gym.make("test/Meshed-v0")
     observation, _ = env.reset(seed=1)
-    assert observation["voltages"].shape == (8,) and len(vessel.carrier(False)[1]) == 0
+    assert observation["voltages"].shape == (8,) and len(vessel.transport_mesh(False)[1]) == 0
     level = np.full(env.action_space.shape, 30.0)
     rewards = [env.step(level)[1] for _ in range(4)]
     assert all(-5.0 < reward < 0.0 for reward in rewards)
@@ -75,7 +75,7 @@ def test_another_file_is_refused(files, vessel):
     """The world names the file by its hash; a group that is missing is named."""
     changed = RoundMeshVessel(files["fine"][0], "0" * 64, *files["coarse"][:2], 8)
     with pytest.raises(ValueError, match=r"fine\.msh: must be the file with SHA-256 0000"):
-        changed.carrier(True)
+        changed.transport_mesh(True)
     many = RoundMeshVessel(*files["fine"][:2], *files["coarse"][:2], 9)
     with pytest.raises(ValueError, match="must have a group for each electrode, got none for electrode 8"):
         many.electrode_model(False)

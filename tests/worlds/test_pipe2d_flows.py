@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 from eitbench.data import episodes
-from eitbench.data.episodes import simulate, truth_discretisation
+from eitbench.data.episodes import cached_truth_model, simulate
 from eitbench.physics.flow import PlaneChannelFlow
 from eitbench.worlds.catalogue import PIPE_2D_BIASED, PIPE_2D_SKEWED, PIPE_2D_TIME_VARYING, PIPE_2D_UNKNOWN
-from eitbench.worlds.streams import randomness
+from eitbench.worlds.random_streams import episode_streams
 from scipy.stats import kstest
 
 from short import merged
@@ -19,7 +19,7 @@ each_unknown = pytest.mark.parametrize("world", WORLDS[1:], ids=lambda world: wo
 
 def drawn(world, seed):
     """The flow of an episode."""
-    return world.flow.draw(world, randomness(seed).flow)
+    return world.flow.draw(world, episode_streams(seed).flow)
 
 
 def mean_velocities(world, seeds):
@@ -30,7 +30,7 @@ def mean_velocities(world, seeds):
 @each_world
 def test_mean_velocity_is_drawn_evenly_from_its_range(world):
     """A uniform distribution between its ends; about its mean where it swings, so there without the swing."""
-    steady = world.changed({"flow": {"swing_range": [0.0, 0.0]}})
+    steady = world.with_changes({"flow": {"oscillation_range": [0.0, 0.0]}})
     low, high = steady.flow.velocity_range
     means = mean_velocities(steady, range(400))
     assert low <= means.min() and means.max() <= high
@@ -41,7 +41,7 @@ def test_estimators_are_told_another_velocity():
     """Their model moves a ramp along the axis by 1.5·v̄ a second, v̄ being what they are told, but
     not what was drawn."""
     for assumed, mean in (({}, 4.5), ({"mean_velocity": 2.0}, 2.0)):
-        transport = PIPE_2D_BIASED.model(**assumed).transport
+        transport = PIPE_2D_BIASED.estimator_model(**assumed).transport
         points = transport.mesh.points
         ramp = 30.0 + 100.0 * points[:, 0]
         axis = np.hypot(points[:, 0] - 0.2, points[:, 1]).argmin()
@@ -70,7 +70,7 @@ def test_mean_velocity_swings_as_a_sine(seed):
     assert misfit < 1e-2 * level
     slowest, fastest = world.flow.velocity_range
     assert slowest <= level <= fastest
-    least, most = world.flow.swing_range
+    least, most = world.flow.oscillation_range
     assert least <= np.hypot(*wave) / level <= most * (1.0 + 1e-3)
     assert fit(2.0)[0] > 0.1 * level
 
@@ -86,10 +86,10 @@ def test_skewness_has_either_sign():
 def test_known_velocity_makes_the_episode_of_the_plain_pipe():
     """With nothing left to draw, and so the same lead-in, it is `PIPE_2D`: the same inflow and noise, to rounding."""
     def of(velocity):
-        return PIPE_2D_BIASED.changed(merged(CHANGES, {"flow": {"velocity_range": [velocity] * 2}}))
+        return PIPE_2D_BIASED.with_changes(merged(CHANGES, {"flow": {"velocity_range": [velocity] * 2}}))
 
     world = of(45.0)
-    assert world.lead_in == TINY.lead_in
+    assert world.spin_up_steps == TINY.spin_up_steps
     assert world.currents.tobytes() == TINY.currents.tobytes()
     fixed, plain = (simulate(each, 7, cache=False) for each in (world, TINY))
     np.testing.assert_allclose(fixed.concentration, plain.concentration, rtol=3e-7)     # of float32
@@ -102,19 +102,19 @@ def test_known_velocity_makes_the_episode_of_the_plain_pipe():
 
 
 def test_slowest_fluid_flushes_the_pipe_before_the_start():
-    """``lead_in`` steps take the slowest mean velocity, its swing included, through the whole pipe."""
+    """``spin_up_steps`` steps take the slowest mean velocity, its swing included, through the whole pipe."""
     for world in WORLDS:
         lowest = min(drawn(world, seed)(t).mean_velocity for seed in range(50) for t in range(0, 100, 5))
         length = world.vessel.length
-        assert world.lead_in * world.time_step * lowest >= length * (1.0 - 1e-12)
-        slowest = world.flow.velocity_range[0] * (1.0 - world.flow.swing_range[1])
-        assert (world.lead_in - 1) * world.time_step * slowest < length
+        assert world.spin_up_steps * world.time_step * lowest >= length * (1.0 - 1e-12)
+        slowest = world.flow.velocity_range[0] * (1.0 - world.flow.oscillation_range[1])
+        assert (world.spin_up_steps - 1) * world.time_step * slowest < length
 
 
 @each_unknown
 def test_recorded_flow_is_the_drawn_one(world):
     """`Episode.velocity` is the profile at `VelocityModel.points` amid each time step, and has the drawn mean."""
-    world = world.changed(FAST)
+    world = world.with_changes(FAST)
     velocity = simulate(world, 7, cache=False).velocity
     model = world.velocity_model
     assert velocity.shape == (5, 24)
@@ -125,18 +125,18 @@ def test_recorded_flow_is_the_drawn_one(world):
         mean = model.weights @ velocity[t - 1] / (2.0 * world.vessel.half_width)
         assert mean == pytest.approx(flow(t).mean_velocity, rel=1e-12)
     changes = np.ptp(velocity, axis=0).max() / velocity.max()
-    assert changes > 1e-3 if world.flow.swing_range[1] else changes == 0.0
+    assert changes > 1e-3 if world.flow.oscillation_range[1] else changes == 0.0
     skewed = np.abs(velocity - velocity[:, ::-1]).max() / velocity.max()
     assert skewed > 0.3 if world.flow.skewness_range[1] else skewed < 1e-12
 
 
 def test_recorded_flow_is_the_one_that_carries():
     """From one recorded state to the next with the recorded mean velocity, in the truth's two steps: to rounding."""
-    world = PIPE_2D_TIME_VARYING.changed(FAST)
+    world = PIPE_2D_TIME_VARYING.with_changes(FAST)
     half_width = world.vessel.half_width
-    truth = truth_discretisation(world)
-    (history,) = world.evolve([randomness(7)], truth, lambda _: None)
-    inflow = world.target.draw_inflow(world, randomness(7).inflow)
+    truth = cached_truth_model(world)
+    (history,) = world.evolve([episode_streams(7)], truth, lambda _: None)
+    inflow = world.target.draw_inflow(world, episode_streams(7).inflow)
     model = world.velocity_model
     inlet = truth.transport.mesh.points[truth.transport.inlet]
     dt = 0.5 * world.time_step
@@ -152,9 +152,9 @@ def test_recorded_flow_is_the_one_that_carries():
 @each_world
 def test_a_reference_is_given_the_flow_that_carries(world):
     """A step with it, on the estimators' mesh, is one with the flow drawn for that very step, to the bit."""
-    world = world.changed(FAST)
-    model, flow = world.model(), drawn(world, 7)
-    transport_at = world.true_transport(model, randomness(7).flow)
+    world = world.with_changes(FAST)
+    model, flow = world.estimator_model(), drawn(world, 7)
+    transport_at = world.true_transport(model, episode_streams(7).flow)
     c = 30.0 + np.random.default_rng(0).normal(size=model.transport.mesh.n_nodes)
     for t in (1, 2, 5):
         real = model.transport.with_velocity(flow(t))
@@ -163,8 +163,8 @@ def test_a_reference_is_given_the_flow_that_carries(world):
 
 def test_simulated_together_same_bits():
     """Flows that differ are carried on one by one: each episode is the one that its seed has alone."""
-    world = PIPE_2D_TIME_VARYING.changed(FAST)
-    together = list(episodes.simulate_together(world, [8, 7], progress=False))
+    world = PIPE_2D_TIME_VARYING.with_changes(FAST)
+    together = list(episodes.simulate_batch(world, [8, 7], progress=False))
     alone = [simulate(world, seed, cache=False) for seed in (8, 7)]
     for one, other in zip(together, alone, strict=True):
         assert [array.tobytes() for array in one] == [array.tobytes() for array in other]

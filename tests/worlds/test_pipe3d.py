@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from eitbench.worlds.catalogue import PIPE_3D
 
-SMALL = PIPE_3D.changed({
+SMALL = PIPE_3D.with_changes({
     "vessel": {"electrode_rings": 2, "electrodes_per_ring": 4}, "flow": {"mean_velocity": 16.0},
     "schedule": {"scored_steps": 2, "pattern": {"frame": 4}}})
 
@@ -12,7 +12,7 @@ SMALL = PIPE_3D.changed({
 @pytest.fixture(scope="module")
 def model():
     """The estimators' model of the small pipe."""
-    return SMALL.model()
+    return SMALL.estimator_model()
 
 
 def areas(cem):
@@ -24,7 +24,7 @@ def areas(cem):
 def test_electrodes_have_their_size_and_place(model):
     """Each is as long as said and a part of the polygon around, and its middle lies at its angle and ring."""
     cem, pipe = model.observation.cem, SMALL.vessel
-    arc = 2.0 * np.pi * pipe.radius / 4 * pipe.electrode_cover
+    arc = 2.0 * np.pi * pipe.radius / 4 * pipe.electrode_coverage
     measured = areas(cem)
     assert len(measured) == 8 and np.ptp(measured) < 1e-12
     area = arc * pipe.electrode_length
@@ -42,7 +42,7 @@ def test_electrodes_have_their_size_and_place(model):
 @pytest.mark.parametrize(("rings", "per_ring"), [(1, 4), (2, 4), (3, 6), (4, 8), (5, 8)])
 def test_every_injection_injects(rings, per_ring):
     """One source and one sink, half a turn apart, odd injections within a ring; all rings take part in a frame."""
-    world = PIPE_3D.changed({"vessel": {"electrode_rings": rings, "electrodes_per_ring": per_ring}})
+    world = PIPE_3D.with_changes({"vessel": {"electrode_rings": rings, "electrodes_per_ring": per_ring}})
     currents = world.currents
     assert currents.shape == (16, rings * per_ring)
     sources, sinks = currents.argmax(axis=1), currents.argmin(axis=1)
@@ -55,7 +55,7 @@ def test_every_injection_injects(rings, per_ring):
 
 def test_slugs_enter_anywhere_within_seven_tenths_of_the_radius():
     """Places are even over the disc: the mean square distance is half the largest."""
-    places = SMALL.vessel.draw_places(np.random.default_rng(0), 20_000)
+    places = SMALL.vessel.sample_inlet_points(np.random.default_rng(0), 20_000)
     distance = np.hypot(*places.T)
     assert distance.max() < 0.7 * SMALL.vessel.radius
     assert np.mean(distance**2) == pytest.approx(0.5 * (0.7 * SMALL.vessel.radius)**2, rel=0.02)
@@ -75,6 +75,6 @@ def test_truth_is_finer_than_the_model(model):
     """No inverse crime: four times the CD nodes, twice the EIT unknowns, half the sub-step; and n ≥ 3,000."""
     pipe, n = SMALL.vessel, model.transport.mesh.n_nodes
     assert n >= 3000
-    assert pipe.carrier(fine=True)[0].n_nodes > 4 * n
+    assert pipe.transport_mesh(fine=True)[0].n_nodes > 4 * n
     assert pipe.electrode_model(fine=True).n_unknowns > 1.8 * model.observation.cem.n_unknowns
-    assert pipe.parts_of_a_step * pipe.substeps(fine=True) >= 2 * pipe.substeps(fine=False)
+    assert pipe.n_truth_steps * pipe.substeps(fine=True) >= 2 * pipe.substeps(fine=False)

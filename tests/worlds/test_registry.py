@@ -27,8 +27,8 @@ class Never:
         return np.empty(0)
 
 
-QUIET = replace(PIPE_2D.changed(PIPE), name="Quiet", target=Slugs(arrivals=Never()))
-OTHER = QUIET.changed({"schedule": {"scored_steps": 6}})
+QUIET = replace(PIPE_2D.with_changes(PIPE), name="Quiet", target=Slugs(arrivals=Never()))
+OTHER = QUIET.with_changes({"schedule": {"scored_steps": 6}})
 PACKAGE = '''
 from eitbench import World, register
 from eitbench.worlds.flows import LaminarFlow
@@ -36,7 +36,7 @@ from eitbench.worlds.slugs import Slugs
 from eitbench.worlds.vessels import PlanePipe
 
 register(World("Theirs", PlanePipe(length=0.3), LaminarFlow(), Slugs()), "theirs/Pipe-v3", lag=2,
-         about="A shorter pipe.", seeds="test:0-3")
+         description="A shorter pipe.", test_seeds="test:0-3")
 '''
 
 
@@ -52,12 +52,12 @@ def restored(monkeypatch):
 
 def hands() -> list[str]:
     """Ids registered by hand."""
-    return [each.id for each in registry.registered_by_hand()]
+    return [each.id for each in registry.runtime_entries()]
 
 
 def test_a_world_is_played_under_its_id():
     """By gymnasium's own `make`; in a pipe into which nothing comes the background is the truth."""
-    register(QUIET, ID, about="Nothing happens.", lag=1)
+    register(QUIET, ID, description="Nothing happens.", lag=1)
     assert list(entries())[-1] == ID
     assert entry(ID) == registry.Entry(ID, QUIET, "estimation", {"lag": 1}, "Nothing happens.")
     env = gym.make(ID)
@@ -125,16 +125,16 @@ def test_an_id_that_nobody_registered_is_named():
 
 def test_another_process_takes_over(tmp_path):
     """What was registered by hand here is played there, with the same bits."""
-    world = PIPE_2D.changed(PIPE)
-    register(world, ID, lag=2, about="Mine.", seeds="test:0-2")
+    world = PIPE_2D.with_changes(PIPE)
+    register(world, ID, lag=2, description="Mine.", test_seeds="test:0-2")
     told = tmp_path / "told"
-    told.write_bytes(pickle.dumps(registry.registered_by_hand()))
+    told.write_bytes(pickle.dumps(registry.runtime_entries()))
     code = ("import pathlib, pickle, sys\n"
             "import gymnasium as gym\n"
             "from eitbench.worlds import entry, registry\n"
             f"told = pickle.loads(pathlib.Path({str(told)!r}).read_bytes())\n"
             "for _ in range(2):\n"
-            "    registry.take_over(told)\n"
+            "    registry.import_entries(told)\n"
             "assert entry(told[0].id) == told[0]\n"
             "env = gym.make(told[0].id)\n"
             "assert env.unwrapped.lag == 2\n"
@@ -147,7 +147,7 @@ def test_another_process_takes_over(tmp_path):
 def test_who_is_told_last_counts():
     """A process that works for one script after another plays what the present one means."""
     register(QUIET, ID)
-    registry.take_over([replace(entry(ID), world=OTHER, settings={"lag": 2})])
+    registry.import_entries([replace(entry(ID), world=OTHER, settings={"lag": 2})])
     assert entry(ID).world == OTHER
     env = gym.make(ID).unwrapped
     assert env.world is OTHER
@@ -178,5 +178,72 @@ def test_modules_of_entry_points_are_imported(monkeypatch, tmp_path):
         "'missing_worlds'"]
     theirs = entry("theirs/Pipe-v3")
     assert theirs.world.vessel.length == 0.3
-    assert (theirs.settings, theirs.seeds) == ({"lag": 2}, "test:0-3")
+    assert (theirs.settings, theirs.test_seeds) == ({"lag": 2}, "test:0-3")
     assert not hands()
+
+
+def test_groups_and_starting_points():
+    """Each built-in id is in a group; six are recommended to begin with."""
+    own = [each for id, each in entries().items() if id.startswith("eitbench/")]
+    assert {each.group for each in own} == set(registry.GROUPS) - {"user-defined"}
+    assert sum(each.is_starting_point for each in own) == 6
+    assert all((each.group == "robustness variants") == bool(each.nominal) for each in own)
+    assert all((each.group == "injection") == (each.track == "injection") for each in own)
+    register(QUIET, ID)
+    assert entry(ID).group == "user-defined"
+    with pytest.raises(ValueError, match=r"group must be one of thesis examples, .*, got 'mine'"):
+        register(QUIET, "mine/Quiet-v1", group="mine")
+
+
+VARIANTS = {"short-slugs", "strong-slugs", "double-noise", "other-velocity", "other-contacts", "other-inlet"}
+
+
+@pytest.mark.parametrize("id", [id for id, each in entries().items() if each.nominal])
+def test_a_variant_is_the_environment_of_its_id(id):
+    """World, task and settings are the same objects; the nominal id alone gives the nominal world."""
+    each = entry(id)
+    assert each.variant in VARIANTS
+    env = gym.make(each.nominal, variant=each.variant).unwrapped
+    other = gym.make(id).unwrapped
+    assert env.world is other.world is each.world
+    assert env.lag == other.lag
+    np.testing.assert_array_equal(env.task.currents, other.task.currents)
+    assert env.task.noise == other.task.noise and env.task.n_steps == other.task.n_steps
+    assert gym.make(each.nominal).unwrapped.world is PIPE_2D
+
+
+def test_episodes_of_a_variant(monkeypatch):
+    """Observations and rewards of a variant are those of its id, single and vectorised, bit by bit."""
+    strong = entry("eitbench/Pipe2DStrongSlugs-v0")
+    registry.import_entries([replace(strong, world=strong.world.with_changes(PIPE))])
+    envs = gym.make("eitbench/Pipe2D-v0", variant="strong-slugs"), gym.make(strong.id)
+    observations = [env.reset(seed=4)[0] for env in envs]
+    for name in ("voltages", "currents"):
+        np.testing.assert_array_equal(*(each[name] for each in observations))
+    action = np.full(envs[0].unwrapped.n_nodes, 31.0)
+    steps = [[env.step(action) for _ in range(4)] for env in envs]
+    assert [step[1] for step in steps[0]] == [step[1] for step in steps[1]]
+    vector = gym.make_vec("eitbench/Pipe2D-v0", num_envs=1, variant="strong-slugs")
+    np.testing.assert_array_equal(vector.reset(seed=[4])[0]["voltages"][0], observations[0]["voltages"])
+    again = gym.make(gym.envs.registration.EnvSpec.from_json(envs[0].spec.to_json()))
+    assert again.unwrapped.world is envs[0].unwrapped.world
+
+
+@pytest.mark.parametrize(("id", "variant", "message"), [
+    ("eitbench/Pipe2D-v0", "strong-slug", r"variant of .*Pipe2D-v0 must be one of short-slugs, strong-slugs, .*; "
+     r"got 'strong-slug'. Did you mean strong-slugs\?"),
+    ("eitbench/Pipe3D-v0", "strong-slugs", "eitbench/Pipe3D-v0 has no variants, got 'strong-slugs'"),
+    ("eitbench/Pipe2DInjection-v0", "x", "eitbench/Pipe2DInjection-v0 has no variants, got 'x'")])
+def test_an_unknown_variant_is_rejected(id, variant, message):
+    """The message lists the variants."""
+    with pytest.raises(ValueError, match=message):
+        gym.make(id, variant=variant)
+
+
+def test_names_of_third_party_variants():
+    """A variant is named after its id; a built-in name is not replaced."""
+    register(PIPE_2D.with_changes({"instrument": {"noise_mismatch": 3.0}}), "mine/Pipe2DTripleNoise-v0",
+             nominal="eitbench/Pipe2D-v0")
+    register(PIPE_2D, "mine/Pipe2DStrongSlugs-v0", nominal="eitbench/Pipe2D-v0")
+    assert entry("eitbench/Pipe2D-v0", "triple-noise").id == "mine/Pipe2DTripleNoise-v0"
+    assert entry("eitbench/Pipe2D-v0", "strong-slugs").id == "eitbench/Pipe2DStrongSlugs-v0"

@@ -2,12 +2,12 @@
 
 import numpy as np
 import pytest
-from eitbench.data.episodes import simulate, truth_discretisation
-from eitbench.data.recordings import cycle_voltages, make_recording
+from eitbench.data.episode_cache import build_cached_episode, cycle_voltages
+from eitbench.data.episodes import cached_truth_model, simulate
 from eitbench.physics.cem import CompleteElectrodeModel
 from eitbench.worlds import entries, entry, register, registry
 from eitbench.worlds.catalogue import (
-    HOME,
+    NOMINAL_ID,
     PIPE_2D,
     PIPE_2D_DOUBLE_NOISE,
     PIPE_2D_OTHER_CONTACTS,
@@ -16,25 +16,25 @@ from eitbench.worlds.catalogue import (
     PIPE_2D_STRONG_SLUGS,
 )
 from eitbench.worlds.instrument import Faults, Instrument
-from eitbench.worlds.streams import randomness
+from eitbench.worlds.random_streams import episode_streams
 from eitbench.worlds.task import make_task
 from eitbench.worlds.vessels import PlanePipe, RoundPipe
 from scipy.stats import kstest
 
 from short import register_apart, world
 
-SHIFTS = [id for id, each in entries().items() if each.home == HOME]
+SHIFTS = [id for id, each in entries().items() if each.nominal == NOMINAL_ID]
 
 
 def small(id):
     """The world of an id, whose episodes take a third of a second."""
-    return entry(id).world.changed(world(id)["world"])
+    return entry(id).world.with_changes(world(id)["world"])
 
 
 @pytest.mark.parametrize("id", SHIFTS)
 def test_the_task_is_that_of_home(id):
     """Numbers, and what the models compute: where fluid is carried, and voltages with their derivatives."""
-    here, there = make_task(small(id)), make_task(small(HOME))
+    here, there = make_task(small(id)), make_task(small(NOMINAL_ID))
     for name in ("noise", "n_steps", "warm_up", "lag", "expected_concentration", "calibration", "prior",
                  "velocity", "vessel"):
         assert getattr(here, name) == getattr(there, name), name
@@ -48,25 +48,25 @@ def test_the_task_is_that_of_home(id):
 
 
 @pytest.mark.parametrize(("id", "changes", "home", "message"), [
-    ("me/Shift-v0", {}, "eitbench/Nowhere-v0", "home must be a registered id that is no shift itself, got 'eitbench/N"),
-    ("me/Shift-v0", {}, SHIFTS[0], "home must be a registered id that is no shift itself"),
-    ("me/Shift-v0", {"instrument": {"noise_relative": 0.02}}, HOME, "me/Shift-v0 and .* differ in noise$"),
-    ("me/Shift-v0", {"schedule": {"scored_steps": 9}}, HOME, "differ in schedule, steps$"),
-    ("me/Shift-v0", {"prior": {"nodal_std": 0.1}}, HOME, "differ in prior$"),
+    ("me/Shift-v0", {}, "eitbench/Nowhere-v0", "nominal must be a registered id that is not shifted itself, got 'e"),
+    ("me/Shift-v0", {}, SHIFTS[0], "nominal must be a registered id that is not shifted itself"),
+    ("me/Shift-v0", {"instrument": {"noise_relative": 0.02}}, NOMINAL_ID, "me/Shift-v0 and .* differ in noise$"),
+    ("me/Shift-v0", {"schedule": {"scored_steps": 9}}, NOMINAL_ID, "differ in schedule, steps$"),
+    ("me/Shift-v0", {"prior": {"nodal_std": 0.1}}, NOMINAL_ID, "differ in prior$"),
     ("me/Shift-v0", {}, "eitbench/Pipe2DFixedLag-v0", "differ in settings$"),
     ("me/Shift-v0", {}, "eitbench/Pipe2DInjection-v0", "differ in track$"),
 ])
 def test_a_home_where_other_things_are_told_is_refused(id, changes, home, message, monkeypatch):
     register_apart(monkeypatch)
     with pytest.raises(ValueError, match=message):
-        register(PIPE_2D.changed(changes), id, home=home)
+        register(PIPE_2D.with_changes(changes), id, nominal=home)
     assert id not in registry.entries()
 
 
 def wave(world, seed, times):
     """ln(c/background) that flows in at the model's inlet, (times, nodes)."""
-    mesh, inlet = world.vessel.carrier(fine=False)
-    inflow = world.target.draw_inflow(world, randomness(seed).inflow)
+    mesh, inlet = world.vessel.transport_mesh(fine=False)
+    inflow = world.target.draw_inflow(world, episode_streams(seed).inflow)
     return np.log(np.array([inflow(mesh.points[inlet], time) for time in times]) / world.background)
 
 
@@ -90,20 +90,20 @@ def test_short_slugs_last_half_as_long():
 
 def test_readings_have_twice_the_noise_that_is_told():
     """Of every kind, and drawn as at home; the fluid is that of home."""
-    assert PIPE_2D_DOUBLE_NOISE.fluid == PIPE_2D.fluid and PIPE_2D_DOUBLE_NOISE.name == PIPE_2D.name
+    assert PIPE_2D_DOUBLE_NOISE.truth_config == PIPE_2D.truth_config and PIPE_2D_DOUBLE_NOISE.name == PIPE_2D.name
     random = np.random.default_rng(0)
     resistance = random.normal(size=(2000, 16, 16))
     currents = random.normal(size=(2000, 16))
     draws = random.normal(size=(2000, 16))
     clean = (resistance @ currents[..., None])[..., 0]
     for floor in (0.0, 3.0):
-        instrument = Instrument(noise_floor=floor, untold_noise=2.0)
+        instrument = Instrument(noise_floor=floor, noise_mismatch=2.0)
         read = instrument.measure(Faults.none(16), np.arange(2000), resistance, currents, draws)
-        told = instrument.believed_noise.std(clean)
+        told = instrument.model_noise.std(clean)
         assert np.std((read - clean) / told) == pytest.approx(2.0, rel=0.02)
-    here, there = small(SHIFTS[2]), small(HOME)
-    assert here.instrument.untold_noise == 2.0
-    entries = make_recording(there, simulate(there, 7))
+    here, there = small(SHIFTS[2]), small(NOMINAL_ID)
+    assert here.instrument.noise_mismatch == 2.0
+    entries = build_cached_episode(there, simulate(there, 7))
     task = make_task(here)
     steps = np.arange(len(entries))
     currents = task.currents[steps % len(task.currents)]
@@ -115,13 +115,14 @@ def test_readings_have_twice_the_noise_that_is_told():
 @pytest.mark.parametrize("seed", [3, 4])
 def test_voltages_are_those_of_electrodes_with_these_contacts(seed):
     """A complete electrode model built anew with the impedances drawn; with those told it is another."""
-    shifted, home = small("eitbench/Pipe2DOtherContacts-v0"), small(HOME)
-    assert shifted.instrument.contact_spread == PIPE_2D_OTHER_CONTACTS.instrument.contact_spread == 0.5
+    shifted, home = small("eitbench/Pipe2DOtherContacts-v0"), small(NOMINAL_ID)
+    assert shifted.instrument == PIPE_2D_OTHER_CONTACTS.instrument
+    assert shifted.instrument.contact_impedance_spread == 0.5
     episode, sound = (simulate(each, seed, cache=False) for each in (shifted, home))
     np.testing.assert_array_equal(episode.concentration, sound.concentration)
     told = shifted.vessel.contact_impedance
-    impedance = told * randomness(seed).contacts.uniform(0.5, 1.5, 4)
-    truth = truth_discretisation(home).observation
+    impedance = told * episode_streams(seed).contacts.uniform(0.5, 1.5, 4)
+    truth = cached_truth_model(home).observation
     sigma = truth.conductivity(truth.interpolation @ episode.concentration[2].astype(float))
     cem = truth.cem
     anew = CompleteElectrodeModel(cem.mesh, cem.electrodes, impedance)
@@ -132,7 +133,7 @@ def test_voltages_are_those_of_electrodes_with_these_contacts(seed):
 
 
 def test_contacts_are_drawn_evenly_and_anew():
-    drawn = np.array([PIPE_2D_OTHER_CONTACTS.instrument.draw_contacts(randomness(seed).contacts, 16)
+    drawn = np.array([PIPE_2D_OTHER_CONTACTS.instrument.draw_contacts(episode_streams(seed).contacts, 16)
                       for seed in range(100)])
     assert drawn.shape == (100, 16) and kstest(drawn.ravel(), "uniform", (0.5, 1.0)).pvalue > 1e-3
     assert len(np.unique(drawn)) == drawn.size
@@ -140,12 +141,13 @@ def test_contacts_are_drawn_evenly_and_anew():
 
 def test_slugs_of_the_other_inlet_are_at_the_walls():
     """Between 0.7 and 0.95 R on both sides, where at home none is; and half as wide as the narrowest there."""
-    places = PlanePipe().draw_places(np.random.default_rng(0), 5000, PIPE_2D_OTHER_INLET.target.reach)[:, 0] / 0.05
+    reach = PIPE_2D_OTHER_INLET.target.radial_range
+    places = PlanePipe().sample_inlet_points(np.random.default_rng(0), 5000, reach)[:, 0] / 0.05
     assert kstest(np.abs(places), "uniform", (0.7, 0.25)).pvalue > 1e-3 and abs(np.sign(places).mean()) < 0.05
-    there = np.abs(PlanePipe().draw_places(np.random.default_rng(0), 5000)) / 0.05
+    there = np.abs(PlanePipe().sample_inlet_points(np.random.default_rng(0), 5000)) / 0.05
     assert there.max() <= 0.7
-    assert PIPE_2D_OTHER_INLET.target.width[1] < PIPE_2D.target.width[0]
-    square = ((RoundPipe().draw_places(np.random.default_rng(0), 5000, (0.7, 0.95)) / 0.05)**2).sum(axis=1)
+    assert PIPE_2D_OTHER_INLET.target.transverse_std[1] < PIPE_2D.target.transverse_std[0]
+    square = ((RoundPipe().sample_inlet_points(np.random.default_rng(0), 5000, (0.7, 0.95)) / 0.05)**2).sum(axis=1)
     assert kstest(square, "uniform", (0.49, 0.95**2 - 0.49)).pvalue > 1e-3          # every area as often
     middle = np.abs(wave(PIPE_2D_OTHER_INLET, 0, np.arange(0.0, 0.3, 5e-3))).max(axis=0)
     assert middle[10] < 0.02 < 0.2 < middle.max()

@@ -7,27 +7,27 @@ from functools import lru_cache
 
 import numpy as np
 import pytest
-from eitbench.data.episodes import simulate, simulate_together, truth_discretisation
+from eitbench.data.episodes import cached_truth_model, simulate, simulate_batch
 from eitbench.numerics.fem import mass_matrix
-from eitbench.numerics.round import electrode_disc
+from eitbench.numerics.round_meshes import electrode_disc
 from eitbench.worlds.bodies import disc_indicator
 from eitbench.worlds.catalogue import ROTATING_TANK_2D as ROTATING
 from eitbench.worlds.catalogue import STATIONARY_TANK_2D as STATIONARY
 from eitbench.worlds.flows import _stirred
-from eitbench.worlds.streams import randomness
+from eitbench.worlds.random_streams import episode_streams
 from eitbench.worlds.vessels import RoundTank
 from scipy.integrate import solve_ivp
 from scipy.stats import kstest
 
-SHORT = ROTATING.changed({"schedule": {"warm_up": 1, "scored_steps": 3}, "vessel": {"n_electrodes": 8}})
+SHORT = ROTATING.with_changes({"schedule": {"warm_up": 1, "scored_steps": 3}, "vessel": {"n_electrodes": 8}})
 """Four injections of the same flow."""
-STILL = STATIONARY.changed({"schedule": {"scored_steps": 4}})
+STILL = STATIONARY.with_changes({"schedule": {"scored_steps": 4}})
 each_world = pytest.mark.parametrize("world", [SHORT, STILL], ids=["rotating", "stationary"])
 
 
 def flow_stream(seed):
     """The stream that an episode's flow, or what stands in it, is drawn from."""
-    return randomness(seed).flow
+    return episode_streams(seed).flow
 
 
 def stirred(rings):
@@ -44,13 +44,13 @@ def episode(world, seed):
 @lru_cache(maxsize=4)
 def both(world):
     """The discretisations of the truth and of the model."""
-    return truth_discretisation(world), world.model()
+    return cached_truth_model(world), world.estimator_model()
 
 
 @pytest.mark.parametrize(("n_electrodes", "cover"), [(16, 0.5), (7, 0.8), (4, 0.05)])
 def test_electrodes_lie_where_the_spans_say(n_electrodes, cover):
     """Each has ``cells_at_electrodes`` facets, whose chords end at its edges and are as long as an arc so cut is."""
-    tank = RoundTank(n_electrodes=n_electrodes, electrode_cover=cover)
+    tank = RoundTank(n_electrodes=n_electrodes, electrode_coverage=cover)
     spans, R = tank.electrode_spans, tank.radius
     np.testing.assert_allclose((spans[:, 1] - spans[:, 0]).sum(), 2.0 * np.pi * cover, rtol=1e-12)
     middles = 2.0 * np.pi * np.arange(n_electrodes) / n_electrodes
@@ -90,7 +90,7 @@ def test_truth_is_finer_than_the_model(world):
 def test_seed_decides_the_episode(world):
     """Same seed, same bits, alone or beside others; another seed, another target and other noise."""
     one, other = episode(world, 7), episode(world, 8)
-    together = list(simulate_together(world, [8, 7], progress=False))
+    together = list(simulate_batch(world, [8, 7], progress=False))
     for mine, theirs in ((one, together[1]), (other, together[0])):
         assert [array.tobytes() for array in mine] == [array.tobytes() for array in theirs]
     assert np.abs(one.concentration - other.concentration).max() > 10.0
@@ -132,11 +132,11 @@ def test_ball_goes_round_on_an_orbit_of_the_flow(seed):
 
 def test_ball_begins_within_its_range():
     """Evenly between the two radii, at any angle: no side of the tank is preferred."""
-    one_step = ROTATING.changed({"schedule": {"warm_up": 0, "scored_steps": 1}})
+    one_step = ROTATING.with_changes({"schedule": {"warm_up": 0, "scored_steps": 1}})
     ball = one_step.target
     starts = np.array([ball.path(one_step, flow_stream(seed))[0] for seed in range(100)])
     part = np.hypot(*starts.T) / ROTATING.vessel.radius
-    low, high = ball.start_radius
+    low, high = ball.initial_radius_range
     assert low <= part.min() and part.max() <= high
     assert kstest(part, "uniform", (low, high - low)).pvalue > 1e-3
     assert kstest(np.arctan2(*starts.T), "uniform", (-np.pi, 2.0 * np.pi)).pvalue > 1e-3
@@ -184,9 +184,9 @@ def test_cylinders_stand_inside_apart_and_anywhere():
         assert low <= of_kind.min() and of_kind.max() <= high
         assert kstest(of_kind, "uniform", (low, high - low)).pvalue > 1e-3
     apart = np.linalg.norm(centres[:, 0] - centres[:, 1], axis=1) - radii.sum(axis=1)
-    assert apart.min() > cylinders.gap and apart.max() > 2.0 * cylinders.gap
+    assert apart.min() > cylinders.min_gap and apart.max() > 2.0 * cylinders.min_gap
     distance = np.linalg.norm(centres, axis=2)
-    assert distance.max() <= cylinders.furthest * radius and (distance + radii).max() < radius
+    assert distance.max() <= cylinders.max_centre_radius * radius and (distance + radii).max() < radius
     angle = np.arctan2(centres[:, 0, 1], centres[:, 0, 0])
     assert kstest(angle, "uniform", (-np.pi, 2.0 * np.pi)).pvalue > 1e-3
 
@@ -203,7 +203,7 @@ def test_cylinders_hold_their_metal():
     """∫(c − background) = π(a₁² + a₂²)·(metal − 1)·background to 1 %; five-fold inside, the background elsewhere."""
     mesh, c = both(STILL)[0].transport.mesh, episode(STILL, 7).concentration[0].astype(float)
     cylinders = STILL.target.draw(STILL, flow_stream(7))
-    metal, background = STILL.target.metal, STILL.background
+    metal, background = STILL.target.concentration_ratio, STILL.background
     expected = np.pi * sum(radius**2 for _, radius in cylinders) * (metal - 1.0) * background
     assert mass_matrix(mesh).sum(axis=0) @ (c - background) == pytest.approx(expected, rel=0.01)
     away = np.min([np.hypot(*(mesh.points - centre).T) - radius for centre, radius in cylinders], axis=0)

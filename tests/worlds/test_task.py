@@ -8,7 +8,7 @@ import eitbench  # noqa: F401 (registers)
 import numpy as np
 import pytest
 from eitbench.data.cache import CACHE_VARIABLE
-from eitbench.data.episodes import Episode, simulate, truth_discretisation
+from eitbench.data.episodes import Episode, cached_truth_model, simulate
 from eitbench.envs.estimation import EstimationEnv
 from eitbench.worlds.catalogue import PIPE_2D
 from eitbench.worlds.task import make_task
@@ -115,7 +115,7 @@ def sizes(discretisation):
 
 def traces_of_truth(task, world):
     """What in ``task`` tells of the truth: episodes, worlds, the fine discretisation, arrays of its size."""
-    truth = truth_discretisation(world)
+    truth = cached_truth_model(world)
     its_own = {id(thing) for thing in reachable(truth) if isinstance(thing, np.ndarray)}
     fine = sizes(truth)
     return [thing for thing in reachable(task)
@@ -125,7 +125,7 @@ def traces_of_truth(task, world):
 
 def test_task_holds_nothing_of_the_truth():
     """Not even while an episode is under way, nor through caches and closures."""
-    assert sizes(truth_discretisation(TINY)).isdisjoint(sizes(TINY.model()))
+    assert sizes(cached_truth_model(TINY)).isdisjoint(sizes(TINY.estimator_model()))
     env = environment(lag=1)
     for _ in played(env, np.full(1701, 30.0)):
         assert traces_of_truth(env.task, TINY) == []
@@ -137,7 +137,7 @@ def test_task_holds_nothing_of_the_truth():
     lambda task, episode: replace(task, noise=lambda: episode),
     lambda task, episode: replace(task, currents=[{"kept": (episode.concentration[1:],)}]),
     lambda task, episode: replace(task, noise=functools.partial(max, TINY)),
-    lambda task, episode: replace(task, observation=truth_discretisation(TINY).observation),
+    lambda task, episode: replace(task, observation=cached_truth_model(TINY).observation),
 ], ids=["attribute", "closure", "container", "world", "fine model"])
 def test_the_search_finds_what_is_hidden(hide):
     """The search above is worth something: a truth that is put into a task is found."""

@@ -9,24 +9,24 @@ import pytest
 from eitbench.worlds import entries
 from eitbench.worlds.catalogue import PIPE_2D, PIPE_3D, ROTATING_TANK_2D, STATIONARY_TANK_2D
 from eitbench.worlds.catalogue import PIPE_2D_TIME_VARYING as DRAWN
-from eitbench.worlds.streams import in_state, randomness
+from eitbench.worlds.random_streams import episode_streams, generator_from_state
 
 
 def test_only_what_is_named_changes():
     """Everything else is the same object; lists become tuples, and a part's part can be changed."""
-    world = PIPE_2D.changed({"target": {"strength": [0.1, 0.2], "arrivals": {"interval": 0.03}},
+    world = PIPE_2D.with_changes({"target": {"log_amplitude": [0.1, 0.2], "arrivals": {"interval": 0.03}},
                              "instrument": {"noise_relative": 0.02}})
-    assert world.target.strength == (0.1, 0.2)
+    assert world.target.log_amplitude == (0.1, 0.2)
     assert world.target.arrivals.interval == 0.03
-    assert world.target.duration == PIPE_2D.target.duration
+    assert world.target.time_std == PIPE_2D.target.time_std
     assert world.instrument.noise_relative == 0.02
     assert world.vessel is PIPE_2D.vessel
     assert world.schedule is PIPE_2D.schedule
     assert world.name == PIPE_2D.name
-    assert PIPE_2D.target.strength == (0.22, 0.40)
-    assert PIPE_2D.changed(None) is PIPE_2D
-    assert PIPE_2D.changed({}) == PIPE_2D
-    back = world.changed({"target": {"strength": [0.22, 0.40], "arrivals": {"interval": 0.02}},
+    assert PIPE_2D.target.log_amplitude == (0.22, 0.40)
+    assert PIPE_2D.with_changes(None) is PIPE_2D
+    assert PIPE_2D.with_changes({}) == PIPE_2D
+    back = world.with_changes({"target": {"log_amplitude": [0.22, 0.40], "arrivals": {"interval": 0.02}},
                           "instrument": {"noise_relative": 0.01}})
     assert back == PIPE_2D
     assert hash(back) == hash(PIPE_2D)
@@ -46,7 +46,7 @@ def test_every_number_can_be_named(id):
 
     changes = numbers(world)
     del changes["name"]
-    again = world.changed(changes)
+    again = world.with_changes(changes)
     assert again == world
     assert hash(again) == hash(world)
     assert pickle.loads(pickle.dumps(world)) == world
@@ -61,16 +61,16 @@ def test_every_number_can_be_named(id):
     (PIPE_2D, {"vessel": {"length": "far"}}, "^world.vessel: length must be a number in m, got 'far'"),
     (PIPE_2D, {"vessel": {"electrodes_per_wall": 2.5}}, "^world.vessel: electrodes_per_wall must be an int"),
     (PIPE_2D, {"flow": {"mean_velocity": 0.0}}, "^world.flow: mean_velocity must be a finite number"),
-    (PIPE_2D, {"target": {"width": [0.02, 0.01]}}, "^world.target: width must be a range"),
+    (PIPE_2D, {"target": {"transverse_std": [0.02, 0.01]}}, "^world.target: transverse_std must be a range"),
     (PIPE_2D, {"target": {"arrivals": {"interval": 0.0}}}, "^world.target.arrivals: interval must be"),
-    (PIPE_2D, {"target": {"reach": [0.5, 1.1]}}, "^world.target: reach must end above 0 and at most at 1"),
-    (PIPE_2D, {"instrument": {"untold_noise": -1.0}}, "^world.instrument: untold_noise must be a finite number in"),
-    (PIPE_2D, {"instrument": {"dead": [8, 8], "failing": [7, 7]}}, "must leave two electrodes sound"),
+    (PIPE_2D, {"target": {"radial_range": [0.5, 1.1]}}, "^world.target: radial_range must end above 0"),
+    (PIPE_2D, {"instrument": {"noise_mismatch": -1.0}}, "^world.instrument: noise_mismatch must be a finite number in"),
+    (PIPE_2D, {"instrument": {"n_dead_range": [8, 8], "n_failing_range": [7, 7]}}, "must leave two electrodes sound"),
     (PIPE_2D, {"schedule": {"time_step": float("nan")}}, "^world.schedule: time_step must be"),
     (PIPE_2D, {"region": [0.0, 0.5]}, "region must be a range 0 ≤ begin < end ≤ 0.4 m"),
     (DRAWN, {"flow": {"velocity_range": (5.0, 4.0)}}, "^world.flow: velocity_range must be a range low ≤ high"),
     (DRAWN, {"flow": {"velocity_range": 4.5}}, r"velocity_range must have shape \(2,\)"),
-    (DRAWN, {"flow": {"swing_range": (0.5, 1.0)}}, "^world.flow: swing_range must lie below 1"),
+    (DRAWN, {"flow": {"oscillation_range": (0.5, 1.0)}}, "^world.flow: oscillation_range must lie below 1"),
     (DRAWN, {"flow": {"period_range": (0.0, 0.4)}}, "^world.flow: period_range must be"),
     (DRAWN, {"flow": {"skewness_range": (0.6, 5.5)}}, "skewness_range below 5"),
     (DRAWN, {"flow": {"velocity_std": -1.0}}, "^world.flow: velocity_std must be"),
@@ -78,20 +78,20 @@ def test_every_number_can_be_named(id):
     (PIPE_3D, {"vessel": {"electrode_length": 0.2}}, "^world.vessel: electrode_length must leave gaps"),
     (PIPE_3D, {"vessel": {"potential_order": 3}}, "^world.vessel: potential_order must"),
     (ROTATING_TANK_2D, {"vessel": {"radius": 0.0}}, "^world.vessel: radius must be"),
-    (ROTATING_TANK_2D, {"vessel": {"electrode_cover": 1.0}}, "electrode_cover"),
+    (ROTATING_TANK_2D, {"vessel": {"electrode_coverage": 1.0}}, "electrode_coverage"),
     (ROTATING_TANK_2D, {"flow": {"stirrer_position": (np.nan, 0.0)}}, "stirrer_position must be"),
-    (ROTATING_TANK_2D, {"target": {"start_radius": (0.5, 0.9)}}, "start_radius must be a range .* keeps the ball"),
+    (ROTATING_TANK_2D, {"target": {"initial_radius_range": (0.5, 0.9)}}, "range .* keeps the disc"),
     (STATIONARY_TANK_2D, {"vessel": {"n_electrodes": 7}}, "n_electrodes must be an integer of at least 8"),
-    (STATIONARY_TANK_2D, {"target": {"gap": 0.12}}, "gap must leave room"),
-    (STATIONARY_TANK_2D, {"target": {"furthest": 0.8}}, "furthest must be"),
-    (STATIONARY_TANK_2D, {"target": {"metal": 0.0}}, "^world.target: metal must be"),
+    (STATIONARY_TANK_2D, {"target": {"min_gap": 0.12}}, "min_gap must leave room"),
+    (STATIONARY_TANK_2D, {"target": {"max_centre_radius": 0.8}}, "max_centre_radius must be"),
+    (STATIONARY_TANK_2D, {"target": {"concentration_ratio": 0.0}}, "^world.target: concentration_ratio must be"),
     (STATIONARY_TANK_2D, {"target": {"small_radius": (0.018, 0.035)}}, "small_radius must not reach beyond large"),
     (STATIONARY_TANK_2D, {"target": {"small_radius": 0.02}}, r"small_radius must have shape \(2,\)"),
 ], ids=str)
 def test_what_is_wrong_is_named(world, changes, message):
     """By the place of the part, the name of the number, what came and what is allowed."""
     with pytest.raises(ValueError, match=message):
-        world.changed(changes)
+        world.with_changes(changes)
 
 
 @pytest.mark.parametrize(("name", "part", "message"), [
@@ -108,10 +108,10 @@ def test_a_generator_goes_on_from_a_state():
     """It draws what the other would, also from a state that went through JSON; what it spawns differs by episode."""
     spawned = []
     for seed in range(3):
-        policy = randomness(seed).policy
+        policy = episode_streams(seed).policy
         state = policy.bit_generator.state
         for given in (state, json.loads(json.dumps(state))):
-            copy = in_state(given)
+            copy = generator_from_state(given)
             assert copy.bit_generator.state == state
             spawned.append(copy.spawn(1)[0].integers(2**63))
         np.testing.assert_array_equal(copy.standard_normal(5), policy.standard_normal(5))

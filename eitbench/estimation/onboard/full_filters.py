@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from eitbench.data.recordings import score_mass, step_error
+from eitbench.data.episode_cache import score_mass, step_error
 from eitbench.estimation.filter import Filter, StateSpace
 from eitbench.estimation.gaussian import LinearMeasurement
 from eitbench.estimation.inflow_window import InflowWindow
@@ -39,7 +39,7 @@ class FullFilters:
         self._levels = levels_of(rules.world)
         self._numbers = self._levels.best(frames, rules.gate)
         self.concentration = np.array([self._levels.concentration(k) for k in self._numbers])
-        space = state_space(rules.world.sound, rules.inflow)
+        space = state_space(rules.world.fault_free, rules.inflow)
         self._filters = [Filter(space, gate=rules.gate) for _ in frames]
         self._last: list[tuple[np.ndarray, ...] | None] = []
         for k, currents in enumerate(cycle(rules.world, len(frames))):

@@ -91,7 +91,7 @@ class Levels:
     @cached_property
     def patches(self) -> np.ndarray:
         """See `patch_averages`."""
-        return patch_averages(self.task.mesh, self.world.vessel.patches)
+        return patch_averages(self.task.mesh, self.world.vessel.coarse_grid_shape)
 
     def noise_std(self, computed: np.ndarray, floor: float) -> np.ndarray:
         """Return the noise (V) that filters assume of computed voltages (..., L).
@@ -118,7 +118,7 @@ _levels = lru_cache(maxsize=2)(Levels)
 
 def levels_of(world: World) -> Levels:
     """Return the levels of a world, made once a process for all that differ in faults only."""
-    return _levels(world.sound)
+    return _levels(world.fault_free)
 
 
 def cycle(world: World, episodes: int) -> np.ndarray:

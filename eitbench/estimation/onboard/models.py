@@ -9,7 +9,7 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from eitbench._notice import say
-from eitbench.data.cache import Key, cached, described, model_key
+from eitbench.data.cache import Key, cached, config_dict, model_key
 from eitbench.estimation.covariance import LowRankCovariance, OpenLoopCovariance
 from eitbench.estimation.filter import Filter
 from eitbench.estimation.forward import LinearisedForwardModel
@@ -106,7 +106,7 @@ def _learned(world: World, part: str) -> dict[str, np.ndarray]:
         return {f"{part}.{name}": array.astype(np.float32) for part, arrays in parts.items()
                 for name, array in arrays.items()}
 
-    arrays = cached(model_key("learned", described(world.sound), LEARNED_VERSION), build)
+    arrays = cached(model_key("learned", config_dict(world.fault_free), LEARNED_VERSION), build)
     return {name.removeprefix(part + "."): array.astype(float) for name, array in arrays.items()
             if name.startswith(part)}
 
@@ -128,7 +128,7 @@ def stored_model(world: World) -> ReducedModel | JointModel:
 def stored_model_key(world: World) -> Key:
     """Return the key of a reduced model, which depends neither on the target nor on the number of
     steps."""
-    sound = described(world.sound)
+    sound = config_dict(world.fault_free)
     numbers = {part: sound[part] for part in ("vessel", "flow", "instrument", "prior")}
     schedule = {part: sound["schedule"][part] for part in ("pattern", "time_step")}
     name = "reduced" if world.velocity_model is None else "joint"
@@ -204,7 +204,7 @@ def make_joint_model(world: World) -> JointModel:
 
 def one_velocity(task: Task) -> VelocityModel:
     """Return the velocity model; ``ValueError`` unless it has one parameter."""
-    if task.velocity is None or task.velocity.size != 1:
+    if task.velocity is None or task.velocity.n_parameters != 1:
         raise ValueError("world must have a flow with one unknown parameter, its mean velocity, "
                          f"got {task.velocity!r}")
     return task.velocity

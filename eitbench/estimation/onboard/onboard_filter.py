@@ -58,7 +58,8 @@ class EpisodeFilters(Protocol):
 
     @staticmethod
     def project(rules: Rules, moment: np.ndarray) -> np.ndarray:
-        """Return moments over what counts (T, n), `eitbench.data.recordings.Integrals`, as `errors`
+        """Return moments over what counts (T, n), `eitbench.data.episode_cache.ScoreIntegrals`,
+        as `errors`
         wants them."""
 
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from eitbench.data.recordings import outline, score_mass
+from eitbench.data.episode_cache import score_mass, scoring_constants
 from eitbench.estimation.onboard.innovation import Innovation
 from eitbench.estimation.onboard.levels import Levels, Linearisation, cycle, deviation, levels_of
 from eitbench.estimation.onboard.models import reduced_states, stored_voltages
@@ -159,7 +159,7 @@ class ReducedFilters:
                              "the truth hardly changes what an injection tells")
         world = self._rules.world
         level = self.concentration[0]
-        mass = outline(world).mass
+        mass = scoring_constants(world).mass
         whole = 0.5 * (mass.sum(axis=0) + mass.sum(axis=1))  # ∫ of each node's function
         beyond = (world.background - level) * whole + entries["moment"]
         states = beyond @ self._shared.states.basis / level
@@ -252,7 +252,7 @@ class Shared:
     @staticmethod
     def of(rules: Rules) -> Shared:
         """Return the cached object of a world and an inflow."""
-        return _shared(rules.world.sound, rules.inflow)
+        return _shared(rules.world.fault_free, rules.inflow)
 
 
 @lru_cache(maxsize=4)

@@ -60,7 +60,7 @@ class Rules:
     @property
     def limit(self) -> str | None:
         """Norm that bounds the currents, or None: actions are numbers of pairs."""
-        return self.world.instrument.limit
+        return self.world.instrument.current_norm
 
     @property
     def budget(self) -> int | None:
@@ -96,7 +96,7 @@ class Rules:
     def name(self) -> str:
         """What was found by search is kept under: the world's name, and whether there are faults or
         a budget."""
-        faults = " with faults" * (self.instrument.most > 0)
+        faults = " with faults" * (self.instrument.max_faulty > 0)
         budget = " with a budget" * (self.budget is not None)
         return self.world.name + faults + budget
 

@@ -53,7 +53,7 @@ class ShiftFamily(NamedTuple):
     @property
     def definitions(self) -> dict[str, Markup]:
         """Heading -> the first paragraph of the description of a shift."""
-        texts = {name: entry(board.records[0]["environment"]["id"]).about
+        texts = {name: entry(board.records[0]["environment"]["id"]).description
                  for name, board in self.shifts.items()}
         return {name: markdown(about.strip().split("\n\n")[0]) for name, about in texts.items()}
 

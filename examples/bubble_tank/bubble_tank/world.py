@@ -10,7 +10,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from eitbench.worlds import Discretisation, History, Prior, Randomness, Target, World, register
+from eitbench.worlds import (
+    Discretisation,
+    EpisodeStreams,
+    Prior,
+    Target,
+    TruthTrajectory,
+    World,
+    register,
+)
 from eitbench.worlds.bodies import disc_indicator
 from eitbench.worlds.flows import NoFlow
 from eitbench.worlds.schedule import Schedule
@@ -29,14 +37,14 @@ class SquareTank:
     """S·m²/mol"""
 
     n_electrodes = 12
-    patches = (6, 6)
-    is_long = False
-    parts_of_a_step = 1
+    coarse_grid_shape = (6, 6)
+    is_elongated = False
+    n_truth_steps = 1
 
     def substeps(self, fine: bool) -> int:
         return 8
 
-    def carrier(self, fine: bool):
+    def transport_mesh(self, fine: bool):
         from eitbench.numerics.mesh import rectangle_mesh
         line = np.linspace(0.0, self.side, 41 if fine else 21)
         return rectangle_mesh(line, line), np.empty(0, dtype=int)
@@ -77,10 +85,10 @@ class Bubble(Target):
     speed: float = 0.10
     """m/s"""
 
-    is_carried = False
+    is_advected = False
 
-    def evolve(self, world: World, episodes: Sequence[Randomness], truth: Discretisation,
-               tick: Callable[[int], object], last: int) -> Iterator[History]:
+    def evolve(self, world: World, episodes: Sequence[EpisodeStreams], truth: Discretisation,
+               tick: Callable[[int], object], last: int) -> Iterator[TruthTrajectory]:
         points = truth.transport.mesh.points
         side = world.vessel.side
         for episode in episodes:
@@ -93,7 +101,7 @@ class Bubble(Target):
                 bubble = disc_indicator(points, np.array([x, height]), self.radius, 0.004)
                 states.append(self.background + (self.concentration - self.background) * bubble)
             tick(world.n_steps)
-            yield History(np.array(states), np.empty((last, 0)))
+            yield TruthTrajectory(np.array(states), np.empty((last, 0)))
 
 
 @dataclass(frozen=True)
@@ -119,5 +127,5 @@ A bubble rises through a square tank of saline with twelve electrodes. Nobody kn
 the estimators' model is a liquid at rest in which every node changes a little at every step.
 """
 
-register(BUBBLE_TANK, "bubbles/BubbleTank-v0", about=ABOUT)
-register(BUBBLE_TANK, "bubbles/BubbleTankInjection-v0", track="injection", about=ABOUT)
+register(BUBBLE_TANK, "bubbles/BubbleTank-v0", description=ABOUT)
+register(BUBBLE_TANK, "bubbles/BubbleTankInjection-v0", track="injection", description=ABOUT)

@@ -21,32 +21,32 @@ from eitbench import _check
 from eitbench.data import cache
 from eitbench.data.episodes import (
     Episode,
+    cache_per_truth,
+    cached_truth_model,
     is_simulated,
-    once,
     simulate,
-    simulate_together,
-    truth_discretisation,
+    simulate_batch,
 )
 from eitbench.physics.profiles import VelocityModel
 from eitbench.worlds.instrument import Faults, Instrument
-from eitbench.worlds.streams import randomness
+from eitbench.worlds.random_streams import episode_streams
 from eitbench.worlds.task import make_task
 from eitbench.worlds.world import World
 
 if TYPE_CHECKING:
     from eitbench.numerics.mesh import Mesh  # finite elements: not needed to play recordings
 
-OUTLINE = 1
+SCORING_VERSION = 1
 """Version of the outlines and region masses that are kept."""
-MARGIN = 12
+EXTRA_STEPS = 12
 """Steps simulated beyond those that the first observation needs: environment checkers take ten."""
-SHIPPED_SEED = 0
+BUNDLED_SEED = 0
 """Seed of the episode whose first steps are shipped: a growing pool starts with it."""
-SPARSE = ("data", "indices", "indptr")
+CSR_ARRAYS = ("data", "indices", "indptr")
 """Arrays that hold a sparse matrix."""
 
 
-class Outline(NamedTuple):
+class ScoringConstants(NamedTuple):
     """The scoring constants that all episodes of a world share."""
 
     mass: sp.csr_array
@@ -56,7 +56,7 @@ class Outline(NamedTuple):
     """V, of the cycle's injections into liquid of the expected concentration."""
 
 
-class Integrals(NamedTuple):
+class ScoreIntegrals(NamedTuple):
     """The integrals that score an episode, t = 1 … T, over what counts."""
 
     moment: np.ndarray
@@ -70,7 +70,7 @@ class Integrals(NamedTuple):
 # -- recordings --
 
 
-def recording(world: World, seed: int) -> np.ndarray:
+def cached_episode(world: World, seed: int) -> np.ndarray:
     """Return the recording of an episode, from the cache or simulated.
 
     Returns
@@ -89,52 +89,53 @@ def recording(world: World, seed: int) -> np.ndarray:
     seed = _check.integer("seed", seed, low=0)
 
     def build() -> dict[str, np.ndarray]:
-        return {"steps": make_recording(world, simulate(world, seed))}
+        return {"steps": build_cached_episode(world, simulate(world, seed))}
 
-    return cache.cached(recording_key(world, seed), build)["steps"]
+    return cache.cached(cached_episode_key(world, seed), build)["steps"]
 
 
-def recording_so_far(world: World, seed: int, needed: int) -> np.ndarray:
+def cached_episode_prefix(world: World, seed: int, needed: int) -> np.ndarray:
     """Return the recording of the whole episode if the cache holds it, else of the ``needed`` first
     steps and some more, in a quarter of the time."""
-    last = needed + MARGIN
-    if last >= world.n_steps or is_recorded(world, seed):
-        return recording(world, seed)
-    entries = _shipped(world.fluid) if seed == SHIPPED_SEED else None
+    last = needed + EXTRA_STEPS
+    if last >= world.n_steps or is_episode_cached(world, seed):
+        return cached_episode(world, seed)
+    entries = _shipped(world.truth_config) if seed == BUNDLED_SEED else None
     if entries is None or len(entries) < needed:
-        entries = make_recording(world, _beginning(world.fluid, seed, last))
+        entries = build_cached_episode(world, _beginning(world.truth_config, seed, last))
     return entries
 
 
 def concentration_at(world: World, seed: int, t: int, needed: int) -> np.ndarray:
-    """Return c_t (n_truth,) in mol/m³ on the truth's mesh; ``needed`` as in `recording_so_far`."""
-    last = needed + MARGIN
+    """Return c_t (n_truth,) in mol/m³ on the truth's mesh; ``needed``: see
+    `cached_episode_prefix`."""
+    last = needed + EXTRA_STEPS
     is_early = t <= last < world.n_steps and not is_simulated(world, seed)
-    episode = _beginning(world.fluid, seed, last) if is_early else simulate(world, seed)
+    episode = _beginning(world.truth_config, seed, last) if is_early else simulate(world, seed)
     return episode.concentration[t].astype(float)
 
 
 @lru_cache(maxsize=8)
 def _beginning(fluid: World, seed: int, last: int) -> Episode:
-    return next(simulate_together(fluid, [seed], last=last))
+    return next(simulate_batch(fluid, [seed], last=last))
 
 
-def recording_key(world: World, seed: int) -> cache.Key:
+def cached_episode_key(world: World, seed: int) -> cache.Key:
     """Return the key of an episode's recording."""
     return cache.episode_key(world, str(seed))
 
 
-def is_recorded(world: World, seed: int) -> bool:
+def is_episode_cached(world: World, seed: int) -> bool:
     """Return whether the cache holds a sound recording."""
-    return cache.is_cached(recording_key(world, seed))
+    return cache.is_cached(cached_episode_key(world, seed))
 
 
-def make_recording(world: World, episode: Episode) -> np.ndarray:
+def build_cached_episode(world: World, episode: Episode) -> np.ndarray:
     """Compute the recording of an episode, or of its beginning."""
     operators = {"": score_operators(world)}
     if world.region is not None:
         operators["region_"] = region_operators(world)
-    entries = np.zeros(len(episode.noise), recording_type(world, operators[""][0].shape[1]))
+    entries = np.zeros(len(episode.noise), step_dtype(world, operators[""][0].shape[1]))
     entries["transfer_resistance"] = episode.transfer_resistance
     entries["noise"] = episode.noise
     for prefix, over in operators.items():
@@ -148,7 +149,7 @@ def make_recording(world: World, episode: Episode) -> np.ndarray:
     return entries
 
 
-def recording_type(world: World, n_nodes: int) -> np.dtype:
+def step_dtype(world: World, n_nodes: int) -> np.dtype:
     """Return the type of one step of a recording; ``n_nodes`` are those of the estimators' mesh."""
     L = world.vessel.n_electrodes
     prefixes = ("",) if world.region is None else ("", "region_")
@@ -156,33 +157,34 @@ def recording_type(world: World, n_nodes: int) -> np.dtype:
         ("moment", "<f4", (n_nodes,)), ("deviation", "<f8"), ("square", "<f8"))]
     velocity = world.velocity_model
     flow = [] if velocity is None else [
-        ("velocity_moment", "<f8", (velocity.size,)), ("velocity_square", "<f8")]
+        ("velocity_moment", "<f8", (velocity.n_parameters,)), ("velocity_square", "<f8")]
     return np.dtype([("transfer_resistance", "<f8", (L, L)), ("noise", "<f8", (L,)),
                      *scores, *flow])
 
 
-def beginning_file(world: World, needed: int = 0) -> cache.File:
+def prefix_file(world: World, needed: int = 0) -> cache.File:
     """Return the shipped beginning: the transfer resistances of the first steps that are not
     scored; the ``needed`` ones must be among them."""
     def build() -> dict[str, np.ndarray]:
-        steps = min(needed + MARGIN, world.warm_up)
-        (episode,) = simulate_together(world.fluid, [SHIPPED_SEED], False, steps)
+        steps = min(needed + EXTRA_STEPS, world.warm_up)
+        (episode,) = simulate_batch(world.truth_config, [BUNDLED_SEED], False, steps)
         return {"transfer_resistance": episode.transfer_resistance}
 
-    key = cache.model_key("beginning", cache.described(world.fluid), cache.SIMULATION)
+    key = cache.model_key("beginning", cache.config_dict(world.truth_config), cache.SIMULATION)
     return cache.File(key, build)
 
 
-@once(4)
+@cache_per_truth(4)
 def _shipped(world: World) -> np.ndarray | None:
     """Return the shipped steps as entries of a recording; their integrals, which no score needs,
     are not those of the truth."""
-    arrays = cache.load_shipped(beginning_file(world).key)
+    arrays = cache.load_shipped(prefix_file(world).key)
     if arrays is None:
         return None
     resistance = arrays["transfer_resistance"]
-    noise = randomness(SHIPPED_SEED).noise.standard_normal((world.n_steps, resistance.shape[1]))
-    entries = np.zeros(len(resistance), recording_type(world, outline(world).mass.shape[0]))
+    random = episode_streams(BUNDLED_SEED).noise
+    noise = random.standard_normal((world.n_steps, resistance.shape[1]))
+    entries = np.zeros(len(resistance), step_dtype(world, scoring_constants(world).mass.shape[0]))
     entries["transfer_resistance"] = resistance
     entries["noise"] = noise[:len(resistance)]
     for name in entries.dtype.names or ():
@@ -195,33 +197,34 @@ def _shipped(world: World) -> np.ndarray | None:
 # -- voltages and scores --
 
 
-def faults_of(world: World, seed: int) -> Faults:
+def instrument_faults(world: World, seed: int) -> Faults:
     """Return the faults of the instrument in an episode."""
-    return world.instrument.draw(randomness(seed).faults, world.vessel.n_electrodes, world.n_steps)
+    random = episode_streams(seed).faults
+    return world.instrument.draw(random, world.vessel.n_electrodes, world.n_steps)
 
 
 def cycle_voltages(world: World, seed: int, entries: np.ndarray) -> np.ndarray:
     """Return the noisy voltages (T, L) in V of the world's injection cycle in an episode."""
     cycle = world.currents
     steps = np.arange(len(entries))
-    return world.instrument.measure(faults_of(world, seed), steps + 1,
+    return world.instrument.measure(instrument_faults(world, seed), steps + 1,
                                     entries["transfer_resistance"], cycle[steps % len(cycle)],
                                     entries["noise"])
 
 
-def integrals(world: World, entries: np.ndarray) -> Integrals:
+def integrals(world: World, entries: np.ndarray) -> ScoreIntegrals:
     """Return the integrals of a recording over what counts."""
     prefix = "" if world.region is None else "region_"
-    return Integrals(*(entries[f"{prefix}{name}"] for name in Integrals._fields))
+    return ScoreIntegrals(*(entries[f"{prefix}{name}"] for name in ScoreIntegrals._fields))
 
 
 def integrate(episode: Episode, background: float, interpolation: sp.csr_array,
-              mass: sp.csr_array) -> Integrals:
+              mass: sp.csr_array) -> ScoreIntegrals:
     """Compute the integrals of an episode for these P and M."""
     c = episode.concentration[1:].astype(float)
     deviation = c - background
     weighted = mass @ deviation.T
-    return Integrals((interpolation.T @ weighted).T.astype(np.float32),
+    return ScoreIntegrals((interpolation.T @ weighted).T.astype(np.float32),
                      np.einsum("tn,nt->t", deviation, weighted),
                      np.einsum("tn,nt->t", c, mass @ c.T))
 
@@ -246,56 +249,58 @@ def velocity_error(velocity: VelocityModel, parameters: np.ndarray, moment: np.n
 # -- constants of a world --
 
 
-@once(4)
-def outline(world: World) -> Outline:
+@cache_per_truth(4)
+def scoring_constants(world: World) -> ScoringConstants:
     """Return the outline of a world, shipped, cached or computed."""
-    arrays = cache.cached(*outline_file(world))
-    return Outline(csr_of(arrays), float(arrays["largest"]))
+    arrays = cache.cached(*scoring_constants_file(world))
+    return ScoringConstants(csr_of(arrays), float(arrays["largest"]))
 
 
-def outline_file(world: World) -> cache.File:
+def scoring_constants_file(world: World) -> cache.File:
     """Return the arrays of a world's outline, which neither flow, target nor contacts change."""
     def build() -> dict[str, np.ndarray]:
-        task = make_task(world.fluid)
+        task = make_task(world.truth_config)
         level = np.full(task.mesh.n_nodes, world.expected_concentration)
-        largest = np.abs(task.observation.voltages(level, world.fluid.currents)).max()
+        largest = np.abs(task.observation.voltages(level, world.truth_config.currents)).max()
         return _half_mass(*score_operators(world)) | {"largest": np.array(largest)}
 
     instrument = Instrument(current=world.instrument.current)
-    fluid = cache.described(replace(world.fluid, instrument=instrument))
+    fluid = cache.config_dict(replace(world.truth_config, instrument=instrument))
     numbers = {name: fluid[name] for name in ("vessel", "instrument", "prior")}
     numbers["pattern"] = fluid["schedule"]["pattern"]
-    return cache.File(cache.model_key("outline", numbers, OUTLINE), build)
+    return cache.File(cache.model_key("outline", numbers, SCORING_VERSION), build)
 
 
-@once(4)
+@cache_per_truth(4)
 def score_mass(world: World) -> sp.csr_array:
-    """Return M̃ (n, n) of what counts, one triangle with doubled entries as `Outline.mass`."""
+    """Return M̃ (n, n) over the scored region, in the form of `ScoringConstants.mass`."""
     if world.region is None:
-        return outline(world).mass
+        return scoring_constants(world).mass
     return csr_of(cache.cached(*region_file(world)))
 
 
 def region_file(world: World) -> cache.File:
     """Return the arrays of the mass matrix of a world's region."""
-    key = cache.model_key("region", [cache.described(world.vessel), world.region], OUTLINE)
+    configuration = [cache.config_dict(world.vessel), world.region]
+    key = cache.model_key("region", configuration, SCORING_VERSION)
     return cache.File(key, lambda: _half_mass(*region_operators(world)))
 
 
-@once(2)
+@cache_per_truth(2)
 def score_operators(world: World) -> tuple[sp.csr_array, sp.csr_array]:
     """Return P and M over the whole vessel."""
     from eitbench.numerics.fem import mass_matrix
-    truth = truth_discretisation(world).transport.mesh
-    return world.vessel.carrier(fine=False)[0].interpolation_to(truth.points), mass_matrix(truth)
+    truth = cached_truth_model(world).transport.mesh
+    model = world.vessel.transport_mesh(fine=False)[0]
+    return model.interpolation_to(truth.points), mass_matrix(truth)
 
 
-@once(2)
+@cache_per_truth(2)
 def region_operators(world: World) -> tuple[sp.csr_array, sp.csr_array]:
     """Return P and M over what counts."""
     interpolation, mass = score_operators(world)
     if world.region is not None:
-        mass = mass_between(truth_discretisation(world).transport.mesh, *world.region)
+        mass = mass_between(cached_truth_model(world).transport.mesh, *world.region)
     return interpolation, mass
 
 
@@ -313,13 +318,13 @@ def mass_between(mesh: Mesh, begin: float, end: float) -> sp.csr_array:
 
 
 def _half_mass(interpolation: sp.csr_array, mass: sp.csr_array) -> dict[str, np.ndarray]:
-    """Return M̃'s upper triangle with doubled entries off the diagonal as `SPARSE` arrays."""
+    """Return M̃'s upper triangle with doubled entries off the diagonal as `CSR_ARRAYS` arrays."""
     full = interpolation.T @ mass @ interpolation
     half = sp.csr_array(sp.triu(full) + sp.triu(full, 1))
-    return {name: getattr(half, name) for name in SPARSE}
+    return {name: getattr(half, name) for name in CSR_ARRAYS}
 
 
 def csr_of(arrays: Mapping[str, np.ndarray]) -> sp.csr_array:
-    """Return the square matrix of `SPARSE` arrays."""
-    data, indices, indptr = (arrays[name] for name in SPARSE)
+    """Return the square matrix of `CSR_ARRAYS` arrays."""
+    data, indices, indptr = (arrays[name] for name in CSR_ARRAYS)
     return sp.csr_array((data, indices, indptr), shape=(len(indptr) - 1,) * 2)

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, eq=False)
-class AtRest:
+class StationaryTransport:
     """A `Transport` in which nothing flows, spreads or enters."""
 
     mesh: Mesh

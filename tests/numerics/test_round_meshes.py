@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from eitbench.numerics.fem import mass_matrix
 from eitbench.numerics.mesh import Mesh, graded, rectangle_mesh
-from eitbench.numerics.round import disc_mesh, electrode_disc, extrude, round_pipe_mesh, uniform_disc
+from eitbench.numerics.round_meshes import disc_mesh, electrode_disc, extrude, round_pipe_mesh, uniform_disc
 from numpy.testing import assert_allclose, assert_array_equal
 
 R = 0.05

@@ -13,9 +13,9 @@ from collections.abc import Sequence
 import numpy as np
 
 from eitbench import _check
-from eitbench.numerics.mesh import Mesh, graded, graded_line, increasing
+from eitbench.numerics.mesh import Mesh, check_increasing, graded, graded_line
 
-TURN = 2.0 * np.pi
+TWO_PI = 2.0 * np.pi
 
 
 def disc_mesh(radii: Sequence[float] | np.ndarray, angles: Sequence[np.ndarray]) -> Mesh:
@@ -43,7 +43,7 @@ def disc_mesh(radii: Sequence[float] | np.ndarray, angles: Sequence[np.ndarray])
     rings = [_check.array(f"angles[{k}]", ring, (None,), units="rad")
              for k, ring in enumerate(angles)]
     for k, ring in enumerate(rings):
-        if len(ring) < 3 or (np.diff(ring) <= 0).any() or ring[-1] >= ring[0] + TURN:
+        if len(ring) < 3 or (np.diff(ring) <= 0).any() or ring[-1] >= ring[0] + TWO_PI:
             raise ValueError(f"angles[{k}] must hold at least three angles in rad, strictly "
                              f"increasing and within one turn, got {ring!r}")
     polar = [r * np.stack([np.cos(ring), np.sin(ring)], axis=1)
@@ -70,7 +70,7 @@ def _between(inner: np.ndarray, outer: np.ndarray, first_inner: int,
     """Counter-clockwise triangles (n_inner + n_outer, 3) between two rings of these angles."""
     i = np.arange(len(inner))
     j = np.arange(len(outer))
-    middle_i, middle_j = (np.mod(0.5 * (ring + np.append(ring[1:], ring[0] + TURN)), TURN)
+    middle_i, middle_j = (np.mod(0.5 * (ring + np.append(ring[1:], ring[0] + TWO_PI)), TWO_PI)
                           for ring in (inner, outer))
     # All edges have one order around the turn; where two middles coincide the inner comes first.
     on_outer = first_outer + _node_at(middle_j, middle_i, "left")
@@ -92,7 +92,7 @@ def uniform_disc(radius: float, rings: int) -> Mesh:
     _check.number("radius", radius, low=0.0, open_low=True, units="m")
     _check.integer("rings", rings, low=1)
     number = np.arange(1, rings + 1)
-    return disc_mesh(radius * number / rings, [TURN * np.arange(n) / n for n in 6 * number])
+    return disc_mesh(radius * number / rings, [TWO_PI * np.arange(n) / n for n in 6 * number])
 
 
 def electrode_disc(radius: float, spans: np.ndarray, cells_at_electrodes: int, rings: int,
@@ -125,7 +125,7 @@ def electrode_disc(radius: float, spans: np.ndarray, cells_at_electrodes: int, r
     _check.integer("rings", rings, low=1)
     around, across = grading
     edges = _check.array("spans", spans, (None, 2), units="rad").ravel()
-    closed = [*edges, *(edges[:1] + TURN)]
+    closed = [*edges, *(edges[:1] + TWO_PI)]
     if len(edges) == 0 or (np.diff(closed) <= 0).any():
         raise ValueError("spans must hold at least one electrode, increase, keep a gap between "
                          f"electrodes and lie within one turn, got {spans!r}")
@@ -134,10 +134,10 @@ def electrode_disc(radius: float, spans: np.ndarray, cells_at_electrodes: int, r
     radii = graded(0.0, radius, rings, across, "stop")
     angles = [wall]
     for r, step in zip(radii[-2:0:-1], np.diff(radii)[-2::-1], strict=True):
-        count = min(len(angles[-1]), max(6, round(TURN * r / step)))
+        count = min(len(angles[-1]), max(6, round(TWO_PI * r / step)))
         part = np.linspace(0.0, 1.0, count, endpoint=False)
-        evenly = wall[0] + TURN * part
-        crowded = np.interp(part * len(wall), np.arange(len(wall) + 1), [*wall, wall[0] + TURN])
+        evenly = wall[0] + TWO_PI * part
+        crowded = np.interp(part * len(wall), np.arange(len(wall) + 1), [*wall, wall[0] + TWO_PI])
         angles.append(evenly + (r / radius)**4 * (crowded - evenly))
     return disc_mesh(radii[1:], angles[::-1])
 
@@ -152,7 +152,7 @@ def extrude(section: Mesh, z: Sequence[float] | np.ndarray) -> Mesh:
     mirror image in z. ``ValueError`` if ``section`` is not a mesh in 2D, or ``z`` does not
     increase.
     """
-    z = increasing("z", z)
+    z = check_increasing("z", z)
     if section.dim != 2:
         raise ValueError(f"section must be a mesh of triangles, got one in {section.dim}D")
     n = section.n_nodes

@@ -8,11 +8,11 @@ from types import SimpleNamespace
 import gymnasium as gym
 import numpy as np
 import pytest
-from eitbench.data import bank, cache, recordings
-from eitbench.data.bank import MOST, Pool, fill, recording_bytes
+from eitbench.data import cache, presimulation
 from eitbench.data.cache import CACHE_VARIABLE, folder
-from eitbench.data.episodes import simulate, simulate_together
-from eitbench.data.recordings import is_recorded, make_recording, recording, recording_key
+from eitbench.data.episode_cache import build_cached_episode, cached_episode, cached_episode_key, is_episode_cached
+from eitbench.data.episodes import simulate, simulate_batch
+from eitbench.data.presimulation import MAX_EPISODES, EpisodeSampler, cached_episode_bytes, presimulate
 from eitbench.worlds import entry
 from eitbench.worlds.catalogue import PIPE_2D, PIPE_2D_DRIFTING
 from joblib.externals.loky import get_reusable_executor
@@ -39,7 +39,7 @@ def place(tmp_path, monkeypatch):
 @pytest.fixture(scope="module")
 def alone():
     """The bytes of each recording when its episode is simulated by itself."""
-    return {seed: make_recording(TINY, simulate(TINY, seed, cache=False)).tobytes() for seed in SEEDS}
+    return {seed: build_cached_episode(TINY, simulate(TINY, seed, cache=False)).tobytes() for seed in SEEDS}
 
 
 @pytest.fixture
@@ -49,9 +49,9 @@ def asked(monkeypatch):
 
     def counting(world, seeds, *more, **options):
         batches.append(list(seeds))
-        return simulate_together(world, seeds, *more, **options)
+        return simulate_batch(world, seeds, *more, **options)
 
-    monkeypatch.setattr(bank, "simulate_together", counting)
+    monkeypatch.setattr(presimulation, "simulate_batch", counting)
     return batches
 
 
@@ -69,26 +69,26 @@ def stamps(place):
 def test_recordings_have_the_bits_of_those_made_alone(n_jobs, place, alone, monkeypatch):
     """Eight at once or spread over processes: each recording is the one of its seed, and no truth lies beside it."""
     get_reusable_executor().shutdown(wait=True)      # workers keep the cache folder they began with
-    assert fill(TINY, SEEDS, n_jobs=n_jobs) == 10
+    assert presimulate(TINY, SEEDS, n_jobs=n_jobs) == 10
     assert names(place) == sorted(f"{seed}.npy" for seed in SEEDS)
-    monkeypatch.setattr(recordings, "simulate", None)               # all are there
-    assert {seed: recording(TINY, seed).tobytes() for seed in SEEDS} == alone
+    monkeypatch.setattr("eitbench.data.episode_cache.simulate", None)               # all are there
+    assert {seed: cached_episode(TINY, seed).tobytes() for seed in SEEDS} == alone
 
 
 def test_only_what_is_missing_is_made(place, asked, alone):
     """In batches of eight. Seeds asked for twice are made once, and a damaged recording counts as missing."""
-    recording(TINY, 2)
+    cached_episode(TINY, 2)
     (place / "2.truth.npy").unlink()
-    assert fill(TINY, [4, 2, 1, 4]) == 2 and asked == [[4, 1]]
+    assert presimulate(TINY, [4, 2, 1, 4]) == 2 and asked == [[4, 1]]
     before = stamps(place)
     assert before.keys() == {"1.npy", "2.npy", "4.npy"}
-    assert fill(TINY, [1, 2, 4]) == fill(TINY, []) == 0 and len(asked) == 1
-    assert fill(TINY, range(12)) == 9 and asked[1:] == [[0, 3, 5, 6, 7, 8, 9, 10], [11]]
+    assert presimulate(TINY, [1, 2, 4]) == presimulate(TINY, []) == 0 and len(asked) == 1
+    assert presimulate(TINY, range(12)) == 9 and asked[1:] == [[0, 3, 5, 6, 7, 8, 9, 10], [11]]
     assert {name: stamps(place)[name] for name in before} == before
-    path = recording_key(TINY, 1).path
+    path = cached_episode_key(TINY, 1).path
     path.write_bytes(path.read_bytes()[:-1])
-    assert fill(TINY, range(12)) == 1 and asked[3:] == [[1]]
-    assert {seed: recording(TINY, seed).tobytes() for seed in SEEDS} == alone
+    assert presimulate(TINY, range(12)) == 1 and asked[3:] == [[1]]
+    assert {seed: cached_episode(TINY, seed).tobytes() for seed in SEEDS} == alone
 
 
 def test_interrupted_fill_keeps_what_is_done_and_resumes(place, asked, alone, monkeypatch):
@@ -104,31 +104,31 @@ def test_interrupted_fill_keeps_what_is_done_and_resumes(place, asked, alone, mo
     with monkeypatch.context() as patch:
         patch.setattr(cache, "store", interrupted)
         with pytest.raises(KeyboardInterrupt):
-            fill(TINY, SEEDS)
+            presimulate(TINY, SEEDS)
     forget()
-    assert [seed for seed in SEEDS if is_recorded(TINY, seed)] == [0, 1, 2]
+    assert [seed for seed in SEEDS if is_episode_cached(TINY, seed)] == [0, 1, 2]
     before = stamps(place)
-    assert fill(TINY, SEEDS) == 7 and asked[1] == [3, 4, 5, 6, 7, 8, 9]
+    assert presimulate(TINY, SEEDS) == 7 and asked[1] == [3, 4, 5, 6, 7, 8, 9]
     assert {name: stamp for name, stamp in stamps(place).items() if name in before} == before
-    assert {seed: recording(TINY, seed).tobytes() for seed in SEEDS} == alone
+    assert {seed: cached_episode(TINY, seed).tobytes() for seed in SEEDS} == alone
 
 
 def test_predicted_size_is_that_of_the_files(place):
     """Within 1 %, with the integrals over a region where there is one."""
-    region = PIPE_2D_DRIFTING.changed(FAST)
+    region = PIPE_2D_DRIFTING.with_changes(FAST)
     for each in (TINY, region):
-        fill(each, [0])
-        size = recording_key(each, 0).path.stat().st_size
-        assert size == pytest.approx(recording_bytes(each), rel=0.03)
-    assert recording_bytes(PIPE_2D) == pytest.approx(881_000, rel=0.01)
+        presimulate(each, [0])
+        size = cached_episode_key(each, 0).path.stat().st_size
+        assert size == pytest.approx(cached_episode_bytes(each), rel=0.03)
+    assert cached_episode_bytes(PIPE_2D) == pytest.approx(881_000, rel=0.01)
 
 
 @pytest.mark.parametrize("seed", [-1, 1.0, True, "1"])
 def test_fill_names_what_is_wrong(seed):
     with pytest.raises(ValueError, match="seeds must be an integer of at least 0"):
-        fill(TINY, [seed])
+        presimulate(TINY, [seed])
     with pytest.raises(ValueError, match="n_jobs must be an integer of at least 1"):
-        fill(TINY, [1], n_jobs=0)
+        presimulate(TINY, [1], n_jobs=0)
 
 
 def test_workers_write_where_the_parent_looks(monkeypatch, tmp_path):
@@ -136,8 +136,8 @@ def test_workers_write_where_the_parent_looks(monkeypatch, tmp_path):
     for name in ("one", "two"):
         monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path / name))
         forget()
-        fill(TINY, [0, 1], n_jobs=2)
-        assert is_recorded(TINY, 0) and is_recorded(TINY, 1), name
+        presimulate(TINY, [0, 1], n_jobs=2)
+        assert is_episode_cached(TINY, 0) and is_episode_cached(TINY, 1), name
 
 
 def test_command_fills_and_resumes(place, asked, alone):
@@ -148,14 +148,14 @@ def test_command_fills_and_resumes(place, asked, alone):
     assert f"3 episodes, 0 MB in {place}" in said
     code, said, _ = command("bank", "--seeds", "train:0-3", "-j", "1", "--env", "eitbench/Pipe2DSmoothing-v0")
     assert code == 0 and "1 simulated, 3 were there" in said and asked == [[0, 1, 2], [3]]
-    assert {seed: recording(TINY, seed).tobytes() for seed in range(4)} == {seed: alone[seed] for seed in range(4)}
+    assert {seed: cached_episode(TINY, seed).tobytes() for seed in range(4)} == {seed: alone[seed] for seed in range(4)}
     assert command("bank", "--seeds", "dev:0", "-j", "1")[0] == 0 and asked[2:] == [[100_000]]
 
 
 def test_full_disk_is_refused_before_anything_is_simulated(place, asked, monkeypatch):
     """One byte too few: exit code 2 and how much is needed; with just enough it goes ahead, and what
     is there already needs no room."""
-    free = [2 * recording_bytes(TINY) - 1]
+    free = [2 * cached_episode_bytes(TINY) - 1]
     monkeypatch.setattr(shutil, "disk_usage", lambda _: SimpleNamespace(free=free[0]))
     code, said, complaint = command("bank", "--seeds", "train:0-1", "-j", "1")
     assert code == 2
@@ -181,15 +181,15 @@ def test_mistakes_are_explained(arguments, message, place, asked):
 
 def test_pool_grows_with_the_resets():
     """1, 8, 16, … up to a thousand; a plain PPO of 20,000 steps meets eight episodes."""
-    random, drawn, found = np.random.default_rng(0), Pool(None), []
+    random, drawn, found = np.random.default_rng(0), EpisodeSampler(None), []
     for _ in range(9000):
         found.append(drawn.size)
-        assert 0 <= drawn.draw(random) < found[-1]
+        assert 0 <= drawn.sample_seed(random) < found[-1]
     assert found[:4] == [1] * 4 and set(found[4:128]) == {8} and set(found[128:256]) == {16}
     changes = [k for k in range(1, 9000) if found[k] != found[k - 1]]
     assert changes == [4] + [8 * 2**k for k in range(4, 10)] + [8 * 1024]
-    assert found[-1] == MOST == max(found)
-    drawn.restart()                                  # after a seeded reset
+    assert found[-1] == MAX_EPISODES == max(found)
+    drawn.reset()                                  # after a seeded reset
     assert drawn.size == 1
 
 
@@ -205,7 +205,7 @@ def test_the_sequence_depends_on_the_seed_alone(id, kwargs):
         return [env.reset()[0] for _ in range(12)]
 
     first = seen()
-    fill(entry(id).world.changed(changes), range(20))
+    presimulate(entry(id).world.with_changes(changes), range(20))
     again = seen()
     for one, other in zip(first, again, strict=True):
         np.testing.assert_equal(one, other)

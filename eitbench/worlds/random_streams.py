@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 
-class Randomness(NamedTuple):
+class EpisodeStreams(NamedTuple):
     """The independent streams of one episode; new ones come last, so that the others stay."""
 
     inflow: np.random.Generator
@@ -25,13 +25,13 @@ class Randomness(NamedTuple):
     """how well electrodes touch the liquid"""
 
 
-def randomness(seed: int) -> Randomness:
+def episode_streams(seed: int) -> EpisodeStreams:
     """The streams of the episode with this seed."""
-    children = np.random.SeedSequence(seed).spawn(len(Randomness._fields))
-    return Randomness(*map(np.random.default_rng, children))
+    children = np.random.SeedSequence(seed).spawn(len(EpisodeStreams._fields))
+    return EpisodeStreams(*map(np.random.default_rng, children))
 
 
-def in_state(state: Mapping[str, Any]) -> np.random.Generator:
+def generator_from_state(state: Mapping[str, Any]) -> np.random.Generator:
     """A generator that goes on from this state of another one, and knows nothing of the seed that
     led to it; what it spawns is of this state only."""
     generator = np.random.default_rng([state["state"]["state"], state["state"]["inc"]])

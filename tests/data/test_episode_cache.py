@@ -9,18 +9,18 @@ import numpy as np
 import pytest
 import scipy.sparse as sp
 from eitbench.data import cache
-from eitbench.data.episodes import simulate, truth_discretisation
-from eitbench.data.recordings import (
-    MARGIN,
+from eitbench.data.episode_cache import (
+    EXTRA_STEPS,
+    cached_episode,
+    cached_episode_prefix,
     concentration_at,
     cycle_voltages,
-    faults_of,
-    is_recorded,
-    outline,
-    recording,
-    recording_so_far,
+    instrument_faults,
+    is_episode_cached,
+    scoring_constants,
     step_error,
 )
+from eitbench.data.episodes import cached_truth_model, simulate
 from eitbench.worlds import entry
 
 from recorded import bits
@@ -55,7 +55,7 @@ def integral_of_square(mesh, nodal):
 @pytest.fixture(scope="module")
 def to_truth():
     """Interpolation from the model's nodes to the truth's, dense."""
-    return values_at(truth_discretisation(TINY).transport.mesh.points, TINY.model().transport.mesh)
+    return values_at(cached_truth_model(TINY).transport.mesh.points, TINY.estimator_model().transport.mesh)
 
 
 @pytest.mark.parametrize("kind", ["near the truth", "good", "bad", "constant", "background"])
@@ -65,7 +65,7 @@ def test_score_is_the_integral_over_the_truth(kind, episode, to_truth):
     To 1e-6 of it, but for 3e-10 that single precision of the moments costs (measured: 6e-11).
     """
     exactly = {"rtol": 1e-6, "atol": 3e-10}
-    mesh, nodes = truth_discretisation(TINY).transport.mesh, TINY.model().transport.mesh.points
+    mesh, nodes = cached_truth_model(TINY).transport.mesh, TINY.estimator_model().transport.mesh.points
     truth = episode.concentration[1:].astype(float)
     nearest, rng = truth @ mesh.interpolation_to(nodes).T, np.random.default_rng(1)
     estimate = {"near the truth": nearest,
@@ -76,7 +76,7 @@ def test_score_is_the_integral_over_the_truth(kind, episode, to_truth):
     exact = integral_of_square(mesh, estimate @ to_truth.T - truth) / integral_of_square(mesh, truth)
     if kind == "near the truth":
         assert exact.max() < 1e-4                   # what the coarser mesh cannot hold, and no more
-    entries, mass = recording(TINY, 7), outline(TINY).mass
+    entries, mass = cached_episode(TINY, 7), scoring_constants(TINY).mass
     scored = step_error(mass, estimate - TINY.background, entries["moment"], entries["deviation"], entries["square"])
     np.testing.assert_allclose(scored, exact, **exactly)
     for t in range(5):                                 # one step at a time, as the environment asks
@@ -87,7 +87,7 @@ def test_score_is_the_integral_over_the_truth(kind, episode, to_truth):
 
 def test_outline_holds_one_triangle_of_the_mass_on_the_estimators_nodes(to_truth):
     """xᵀ·mass·x = ∫(Px)² over the truth's triangles for any x, and nothing is stored below the diagonal."""
-    mass, mesh = outline(TINY).mass, truth_discretisation(TINY).transport.mesh
+    mass, mesh = scoring_constants(TINY).mass, cached_truth_model(TINY).transport.mesh
     assert mass.shape == (1701, 1701) and sp.tril(mass, -1).nnz == 0 and sp.triu(mass, 1).nnz > 1701
     for x in np.random.default_rng(2).normal(size=(5, 1701)):
         assert x @ (mass @ x) == pytest.approx(integral_of_square(mesh, to_truth @ x), rel=1e-12)
@@ -95,14 +95,14 @@ def test_outline_holds_one_triangle_of_the_mass_on_the_estimators_nodes(to_truth
 
 def test_outline_knows_the_largest_voltage():
     """That of the whole injection cycle into liquid of the expected concentration."""
-    observation, level = TINY.model().observation, np.full(1701, TINY.expected_concentration)
+    observation, level = TINY.estimator_model().observation, np.full(1701, TINY.expected_concentration)
     largest = max(np.abs(observation.transfer_resistance(level) @ currents).max() for currents in TINY.currents)
-    assert outline(TINY).largest_voltage == pytest.approx(largest, rel=1e-10)
+    assert scoring_constants(TINY).largest_voltage == pytest.approx(largest, rel=1e-10)
 
 
 def test_resistances_and_noise_are_those_of_the_episode(episode):
     """Nothing is rounded of what makes the voltages."""
-    entries = recording(TINY, 7)
+    entries = cached_episode(TINY, 7)
     assert entries.shape == (5,) and entries["moment"].shape == (5, 1701)
     for name in ("transfer_resistance", "noise"):
         mine, theirs = entries[name], getattr(episode, name)
@@ -111,7 +111,7 @@ def test_resistances_and_noise_are_those_of_the_episode(episode):
 
 def test_cycle_voltages_are_those_of_the_episode(episode):
     """Step by step what `Episode.voltages` says of the cycle's currents, which begin anew after each frame."""
-    voltages = cycle_voltages(TINY, 7, recording(TINY, 7))
+    voltages = cycle_voltages(TINY, 7, cached_episode(TINY, 7))
     assert voltages.shape == (5, 4)
     for t, currents in enumerate(TINY.currents[[0, 1, 0, 1, 0]], start=1):
         np.testing.assert_allclose(voltages[t - 1], episode.voltages(t, currents, TINY), rtol=1e-12)
@@ -120,10 +120,10 @@ def test_cycle_voltages_are_those_of_the_episode(episode):
 def test_cycle_voltages_have_the_faults_of_the_episode():
     """What is broken reads interference, and a current that would have to pass it does not flow;
     the recording is the same."""
-    faulty = TINY.changed({"instrument": {"dead": [1, 1], "interference": 50.0}})
-    entries = recording(TINY, 7)
-    assert bits(recording(faulty, 7)) == bits(entries)
-    (broken,) = np.flatnonzero(faults_of(faulty, 7).broken_from == 0)
+    faulty = TINY.with_changes({"instrument": {"n_dead_range": [1, 1], "interference": 50.0}})
+    entries = cached_episode(TINY, 7)
+    assert bits(cached_episode(faulty, 7)) == bits(entries)
+    (broken,) = np.flatnonzero(instrument_faults(faulty, 7).open_circuit_from == 0)
     sound, read = (cycle_voltages(world, 7, entries) for world in (TINY, faulty))
     np.testing.assert_array_equal(read[:, broken], 50.0 * entries["noise"][:, broken])
     passes = np.array([TINY.currents[t % 2, broken] != 0.0 for t in range(5)])
@@ -135,7 +135,7 @@ def test_cycle_voltages_have_the_faults_of_the_episode():
 
 def test_playing_what_is_stored_needs_no_finite_elements(episode):
     """With recording and outline on disk, making, resetting and stepping an environment builds no mesh."""
-    recording(TINY, 7), outline(TINY)
+    cached_episode(TINY, 7), scoring_constants(TINY)
     program = (f"import sys, gymnasium as gym, numpy as np, eitbench\n"
                f"env = gym.make('eitbench/Pipe2D-v0', world={CHANGES!r})\n"
                "env.reset(seed=7)\n"
@@ -156,17 +156,17 @@ def longer(id):
 @pytest.mark.parametrize("id", ["eitbench/Pipe2DFixedLag-v0", "eitbench/Pipe2DInjectionFlow-v0",
                                 "eitbench/RotatingTankInjection-v0", "eitbench/StationaryTank2D-v0"])
 def test_first_steps_have_the_bits_of_the_whole(id):
-    world = entry(id).world.changed(longer(id))
-    begun = recording_so_far(world, 3, 1)
-    assert len(begun) == 1 + MARGIN and not is_recorded(world, 3)
-    states = [concentration_at(world, 3, t, 1) for t in (0, 1 + MARGIN)]
+    world = entry(id).world.with_changes(longer(id))
+    begun = cached_episode_prefix(world, 3, 1)
+    assert len(begun) == 1 + EXTRA_STEPS and not is_episode_cached(world, 3)
+    states = [concentration_at(world, 3, t, 1) for t in (0, 1 + EXTRA_STEPS)]
     assert not list(cache.folder(world).glob("3.*"))                       # nothing is left behind
-    whole = recording(world, 3)
-    assert begun.tobytes() == whole[:1 + MARGIN].tobytes()
+    whole = cached_episode(world, 3)
+    assert begun.tobytes() == whole[:1 + EXTRA_STEPS].tobytes()
     truth = simulate(world, 3).concentration
-    for t, state in zip((0, 1 + MARGIN), states, strict=True):
+    for t, state in zip((0, 1 + EXTRA_STEPS), states, strict=True):
         assert (state == truth[t]).all()
-    assert len(recording_so_far(world, 3, 1)) == world.n_steps
+    assert len(cached_episode_prefix(world, 3, 1)) == world.n_steps
 
 
 @pytest.mark.parametrize(("id", "kwargs"), [
@@ -174,7 +174,7 @@ def test_first_steps_have_the_bits_of_the_whole(id):
     ("eitbench/RotatingTankInjection-v0", {})])
 def test_playing_is_the_same_whether_it_was_recorded_before(id, kwargs):
     """Observations and rewards, to the bit; nothing is recorded before a step needs it."""
-    world = entry(id).world.changed(longer(id))
+    world = entry(id).world.with_changes(longer(id))
 
     def played():
         env = gym.make(id, world=longer(id), **kwargs)
@@ -182,15 +182,15 @@ def test_playing_is_the_same_whether_it_was_recorded_before(id, kwargs):
         env.action_space.seed(0)
         seen = [observation]
         ended = False
-        recorded = [is_recorded(world, 4)]
+        recorded = [is_episode_cached(world, 4)]
         while not ended:
             observation, reward, ended, _, _ = env.step(env.action_space.sample())
             seen += [observation, reward]
-            recorded.append(is_recorded(world, 4))
+            recorded.append(is_episode_cached(world, 4))
         return seen, recorded
 
     first, recorded = played()
-    assert not any(recorded[:MARGIN]) and recorded[-1]
+    assert not any(recorded[:EXTRA_STEPS]) and recorded[-1]
     again, recorded = played()
     assert all(recorded)
     for one, other in zip(first, again, strict=True):
