@@ -147,9 +147,10 @@ def fit_prior(
     regimes = {} if quiet is None else {"quiet": quiet}
     with options.clear_errors():
         prior = fit_prior_from_episodes(
-            entry(env).world, parse_seeds(seeds), link=link.value, nugget=nugget, kept=kept,
-            quiet_threshold=quiet, source={"environment": env, "seeds": seeds, "nugget": nugget,
-                                 "kept": kept, **regimes})
+            entry(env).world, parse_seeds(seeds), link=link.value, nugget=nugget,
+            variance_cutoff=kept, quiet_threshold=quiet,
+            source={"environment": env, "seeds": seeds, "nugget": nugget, "kept": kept,
+                    **regimes})
         prior.save(out)
     options.say(f"{out}: {prior.modes.shape[1]} modes across {len(prior.points)} nodes of the "
                 f"inlet, correlated over {prior.correlation_steps} steps of {prior.time_step:g} s")
