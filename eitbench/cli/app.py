@@ -167,13 +167,13 @@ def leaderboard(
     from eitbench._files import write_atomically
     from eitbench.bench.episode_table import table_beside, write_episode_table
     from eitbench.bench.records import read_sound_files
-    from eitbench.report.boards import read_for_boards
+    from eitbench.report.boards import read_leaderboard_records
     from eitbench.report.site import collect, render, render_site, write_site
     with options.clear_errors():
-        found, complaints = read_for_boards(records)
+        found, complaints = read_leaderboard_records(records)
         out = records.parent
         site = collect(found, out)
-        complaints += site.measured.complaints
+        complaints += site.measured.errors
         texts = render(site)
         write_site(out / "site", render_site(site))
     for name, text in texts.items():
@@ -199,11 +199,11 @@ def compare(
     better; over several environments by gains, as on the boards."""
     from eitbench.report import compare as comparison
     with options.clear_errors():
-        ours, theirs = (comparison.find(name, records) for name in (a, b))
-        table = comparison.compare(ours, theirs, score, comparison.floors(records))
-    names = comparison.names(ours[0], theirs[0])
+        ours, theirs = (comparison.find_records(name, records) for name in (a, b))
+        table = comparison.compare(ours, theirs, score, comparison.naive_baseline_records(records))
+    names = comparison.display_names(ours[0], theirs[0])
     width = shutil.get_terminal_size().columns
-    options.say(comparison.in_terminal(table, *names, score, width))
+    options.say(comparison.format_comparison(table, *names, score, width))
 
 
 @app.command()

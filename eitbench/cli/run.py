@@ -100,25 +100,25 @@ def report(out: Path, asked: Sequence[Job] = (), worlds: Sequence[dict[str, Any]
     ``before`` are results of records that the table shows too."""
     from eitbench._files import write_atomically
     from eitbench.bench.store import EpisodeStore
-    from eitbench.report.boards import anchors, run_boards, shipped_anchors
-    from eitbench.report.failures import asked_of
+    from eitbench.report.boards import anchors, bundled_anchors, run_leaderboards
+    from eitbench.report.failures import select_requested
     from eitbench.report.page import write_page
     from eitbench.report.policies import gap_text, policy_rows
-    from eitbench.report.sweep import sweeps, swept
+    from eitbench.report.sweep import sweeps, swept_parameter
     from eitbench.report.tables import markdown, terminal_tables
     store = EpisodeStore(out)
     records = store.write_records()
     if not records and not before:
         raise typer.BadParameter(f"no results in {out}; make some with `eitbench run`")
-    known = {**shipped_anchors(records), **anchors(records)}
-    boards = run_boards(records, known)
+    known = {**bundled_anchors(records), **anchors(records)}
+    boards = run_leaderboards(records, known)
     write_atomically(out / "leaderboard.md", markdown(boards).encode())
-    told = asked_of(store.records(before), asked) if asked else records
-    number = swept(worlds)
+    told = select_requested(store.records(before), asked) if asked else records
+    number = swept_parameter(worlds)
     found = sweeps(told, number) if number else []
     width = shutil.get_terminal_size().columns
     options.say("\n\n".join(each.text(width) for each in found) if found
-                else terminal_tables(run_boards(told, known), width))
+                else terminal_tables(run_leaderboards(told, known), width))
     for name in dict.fromkeys(job.environment.name for job in asked):
         jobs = [job for job in asked if job.environment.name == name]
         if gap := gap_text(policy_rows(jobs, [*before, *store.results()])):

@@ -25,9 +25,9 @@ from eitbench.envs.rendering import (
     STD_COLORMAP,
     draw_comparison,
 )
-from eitbench.report.plot import one_seed, played, states_at
+from eitbench.report.plot import parse_single_seed, run_until, states_at
 
-MOVING = (".gif", ".webp")
+ANIMATION_SUFFIXES = (".gif", ".webp")
 """Suffixes of animations."""
 
 
@@ -39,11 +39,11 @@ def animate(environment: str, methods: Sequence[str], seed: str, step: int | Non
     ``ValueError`` if a method cannot play the environment, several are policies, or the path's
     suffix is not .gif or .webp (.png with ``step``).
     """
-    suffixes = MOVING if step is None else (".png",)
+    suffixes = ANIMATION_SUFFIXES if step is None else (".png",)
     if path.suffix not in suffixes:
         how = "without" if step is None else "with"
         raise ValueError(f"out must end in {' or '.join(suffixes)} {how} step, got {path.name}")
-    number = one_seed(seed)
+    number = parse_single_seed(seed)
     asked = Environment(environment)
     if asked.track == "injection" and len(methods) > 1:
         raise ValueError(f"policy must be one for {environment}, got {', '.join(methods)}")
@@ -60,7 +60,7 @@ def animate(environment: str, methods: Sequence[str], seed: str, step: int | Non
         first, last = env.world.warm_up + 1, env.world.n_steps
         if step is not None:
             first = last = _check.integer("step", step, low=begin, high=last)
-        draw = _drawn if len(loaded) == 1 else _compared
+        draw = _env_frames if len(loaded) == 1 else _compared_frames
         frames = [Image.fromarray(frame)
                   for frame in draw(env, loaded, number, range(first, last + 1, every))]
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -77,14 +77,14 @@ def animate(environment: str, methods: Sequence[str], seed: str, step: int | Non
     return path
 
 
-def _drawn(env: Any, loaded: list[Method], seed: int, at: range) -> Iterator[np.ndarray]:
+def _env_frames(env: Any, loaded: list[Method], seed: int, at: range) -> Iterator[np.ndarray]:
     """What the environment draws of one method at these t."""
-    for t, *_ in played(env, loaded[0], seed, at[-1]):
+    for t, *_ in run_until(env, loaded[0], seed, at[-1]):
         if t in at:
             yield np.asarray(env.render())
 
 
-def _compared(env: Any, loaded: list[Method], seed: int, at: range) -> Iterator[np.ndarray]:
+def _compared_frames(env: Any, loaded: list[Method], seed: int, at: range) -> Iterator[np.ndarray]:
     """Truth and the estimates of several baselines at these t."""
     shown = [(method.title, states_at(env, method, seed, at)) for method in loaded]
     for t in at:

@@ -1,6 +1,6 @@
 """Leaderboards from records: columns, scores, intervals, gains, skills and ranks.
 
-A board is a list of rows, and the cells of all rows are one tidy table (`board_table`).
+A board is a list of rows, and the cells of all rows are one tidy table (`leaderboard_table`).
 """
 
 from __future__ import annotations
@@ -41,26 +41,27 @@ from eitbench.scoring import skill
 
 ALL = "all"
 """Name of the environment in the rows of an aggregate."""
-IDENTITY = ("class", "environment", "method", "version", "title", "rank", "note", "official",
+IDENTITY_FIELDS = ("class", "environment", "method", "version", "title", "rank", "note", "official",
             "seeds")
-INTERVALS = ("error", "gain")
+INTERVAL_SCORES = ("error", "gain")
 """Numbers with an interval."""
-ANCHORS = ("homogeneous", "true_model_smoother")
+SKILL_ANCHORS = ("homogeneous", "true_model_smoother")
 """Methods with skills 0 and 1."""
 Anchors = Mapping[tuple[str, str, str], Mapping[str, float]]
 """Method, world, split -> seed -> ẽ_c."""
-SPLITS = ("test", "dev", "train", "own")
+SPLIT_ORDER = ("test", "dev", "train", "own")
 """Order of the boards of splits."""
-_NOT_THE_WORLD = ("lag", "assume", "gate", "inflow", "episodes", "render_mode", "observation",
+_NON_WORLD_KWARGS = ("lag", "assume", "gate", "inflow", "episodes", "render_mode", "observation",
                   "estimator")
 """Arguments of an environment that leave its true episodes unchanged."""
-_GAIN = ("gain", "1 − ẽ_c / ẽ_c of the floor (homogeneous; random_pair) in the same episode: 0 as "
-         "the floor, 1 perfect. Interquartile mean with its 95 % bootstrap interval")
-_SKILL = ("skill", "(E_h − E) / (E_h − E_s): 0 for the homogeneous estimate, 1 for the "
+_SKILL_SCORE = (
+    "gain", "1 − ẽ_c / ẽ_c of the floor (homogeneous; random_pair) in the same episode: 0 as the "
+    "floor, 1 perfect. Interquartile mean with its 95 % bootstrap interval")
+_NORMALISED_SCORE = ("skill", "(E_h − E) / (E_h − E_s): 0 for the homogeneous estimate, 1 for the "
           "fixed-interval smoother with the true flow, both from the whole record where the "
           "environment has such a board, so that filters may fall below 0. With †, where these two "
           "have no record of the same episodes: 1 − contrast")
-COSTS = {
+COST_COLUMNS = {
     "matmuls_per_step": (
         "products/step", "time per step in units of a 1000 × 1000 × 1000 matrix product on one "
         "thread of that processor, the median of all that were timed on it"),
@@ -71,14 +72,14 @@ _RANK = ("1 + the number of methods that are significantly better; shared where 
          "every episode have none")
 
 
-class Row(NamedTuple):
+class MethodRow(NamedTuple):
     """One method on a board."""
 
     cells: dict[str, Any]
-    """Values of `fields`; None where there is no value."""
+    """Values of `csv_fields`; None where there is no value."""
     record: dict[str, Any] | None = None
     """Restricted to the board's episodes; None in an aggregate."""
-    gains: dict[str, float] = {}  # noqa: RUF012 (never changed)
+    skill_scores: dict[str, float] = {}  # noqa: RUF012 (never changed)
     """Seed -> gain over the floor; empty without a floor."""
     colour: int = 0
 
@@ -88,7 +89,7 @@ class Row(NamedTuple):
         return f"{self.cells['method']}@{self.cells['version']}"
 
     @property
-    def competes(self) -> bool:
+    def is_ranked(self) -> bool:
         """Whether it has a rank."""
         return self.cells["rank"] is not None
 
@@ -107,7 +108,7 @@ class Row(NamedTuple):
         """Whether it has finished every episode."""
         return not re.search("failed|missing", self.cells["note"])
 
-    def three(self, name: str) -> tuple[float, float, float]:
+    def interval(self, name: str) -> tuple[float, float, float]:
         """Return a score and the ends of its interval; NaN and infinite where unknown."""
         unknown = {name: math.nan, f"{name}_low": -math.inf, f"{name}_high": math.inf}
         value, low, high = (default if self.cells[key] is None else self.cells[key]
@@ -115,13 +116,13 @@ class Row(NamedTuple):
         return value, low, high
 
 
-class Board(NamedTuple):
+class Leaderboard(NamedTuple):
     """One environment, or the aggregate of a class."""
 
-    of_class: str
+    category: str
     environment: str
     title: str
-    rows: list[Row]
+    rows: list[MethodRow]
     """Best first."""
 
     @property
@@ -146,7 +147,7 @@ class Board(NamedTuple):
     @property
     def anchor(self) -> str:
         """Identifier of its table in the index."""
-        return f"board-{self.of_class}-{self.environment}"
+        return f"board-{self.category}-{self.environment}"
 
 
 # -- columns ---------------------------------------------------------------------------------------
@@ -159,62 +160,63 @@ def columns(*, measured: bool = True) -> dict[str, tuple[str, str]]:
     each = {name: (score.heading, score.explanation) for name, score in known.items()}
     heading, text = each.pop("error")
     text += "; mean over the episodes with its 95 % interval; lower is better"
-    return {"error": (heading, text), "gain": _GAIN, "skill": _SKILL} | each | COSTS
+    first = {"error": (heading, text), "gain": _SKILL_SCORE, "skill": _NORMALISED_SCORE}
+    return first | each | COST_COLUMNS
 
 
 def headings(*, measured: bool = False) -> dict[str, str]:
     """Return column -> heading of all numbers without an interval."""
     return {name: heading for name, (heading, _) in columns(measured=measured).items()
-            if name not in INTERVALS}
+            if name not in INTERVAL_SCORES}
 
 
-def meanings(*, measured: bool = False) -> dict[str, str]:
+def column_descriptions(*, measured: bool = False) -> dict[str, str]:
     """Return heading -> explanation."""
     return {"rank": _RANK} | dict(columns(measured=measured).values())
 
 
-def fields() -> list[str]:
+def csv_fields() -> list[str]:
     """Return the columns of leaderboard.csv."""
-    ends = [f"{name}{end}" for name in INTERVALS for end in ("", "_low", "_high")]
-    return [*IDENTITY, *ends, *headings()]
+    ends = [f"{name}{end}" for name in INTERVAL_SCORES for end in ("", "_low", "_high")]
+    return [*IDENTITY_FIELDS, *ends, *headings()]
 
 
-def board_table(found: Iterable[Board]) -> pd.DataFrame:
-    """Return one row for each row of the boards, with the columns of `fields`."""
+def leaderboard_table(found: Iterable[Leaderboard]) -> pd.DataFrame:
+    """Return one row for each row of the boards, with the columns of `csv_fields`."""
     rows = [row.cells for board in found for row in board.rows]
-    types: dict[str, Any] = dict.fromkeys(fields()[len(IDENTITY):], float)
-    return pd.DataFrame(rows, columns=fields()).astype(types | {"rank": "Int64"})
+    types: dict[str, Any] = dict.fromkeys(csv_fields()[len(IDENTITY_FIELDS):], float)
+    return pd.DataFrame(rows, columns=csv_fields()).astype(types | {"rank": "Int64"})
 
 
 def boards(records: list[dict[str, Any]]) -> pd.DataFrame:
-    """Return the `leaderboards` of records as one table of `fields`."""
-    return board_table(leaderboards(records))
+    """Return the `leaderboards` of records as one table of `csv_fields`."""
+    return leaderboard_table(leaderboards(records))
 
 
 # -- environments ----------------------------------------------------------------------------------
 
 
-def class_of(record: dict[str, Any]) -> str:
+def record_category(record: dict[str, Any]) -> str:
     """Return the class in `CLASSES` of a record."""
     return class_of_board(record["environment"]["id"], record["board"])
 
 
-def kind_of(id: str) -> str:
+def base_environment(id: str) -> str:
     """``eitbench/Pipe2DSmoothing-v0`` -> ``Pipe2D``."""
     name = re.sub(r"(FixedLag|Smoothing)(?=(-v\d+)?$)", "", id)
     return name.removeprefix("eitbench/").removesuffix("-v0")
 
 
-def world(record: dict[str, Any]) -> str:
+def world_key(record: dict[str, Any]) -> str:
     """Return the name of what environments with the same true episodes share: ``Pipe2D
     (scored_steps=3)``."""
     environment = record["environment"]
     changed = {key: value for key, value in environment["kwargs"].items()
-               if key not in _NOT_THE_WORLD}
-    return kind_of(environment["id"]) + _arguments(changed)
+               if key not in _NON_WORLD_KWARGS}
+    return base_environment(environment["id"]) + _arguments(changed)
 
 
-def title_of(record: dict[str, Any]) -> str:
+def environment_title(record: dict[str, Any]) -> str:
     """Return the environment's id without its prefix, and its arguments."""
     environment = record["environment"]
     given = {} if environment["name"] == named(environment["id"], {}) else environment["kwargs"]
@@ -232,13 +234,13 @@ def _arguments(kwargs: dict[str, Any]) -> str:
 # -- boards ----------------------------------------------------------------------------------------
 
 
-def leaderboards(records: list[dict[str, Any]]) -> list[Board]:
+def leaderboards(records: list[dict[str, Any]]) -> list[Leaderboard]:
     """Return a board for each environment, class by class, each class followed by its aggregate.
 
     The episodes of a board are those that its floor has played; without a floor, all. Superseded
     records are left out. An aggregate, with ``environment`` `ALL`, is of the methods that have
-    finished every episode of all `counted` environments with a floor, if there are several
-    (with an official floor, where there is any). ``seconds_per_step`` is in ms of the fastest
+    finished every episode of all `aggregate_environments` with a floor, if there are several (with
+    an official floor, where there is any). ``seconds_per_step`` is in ms of the fastest
     episode, ``voltage_discrepancy`` in mV², ``peak_memory`` in 10⁶ bytes.
 
     Raises
@@ -252,15 +254,16 @@ def leaderboards(records: list[dict[str, Any]]) -> list[Board]:
                              f"{file_name(record)} has {record['split']} seeds")
     current, _ = newest(records)
     known = anchors(current)
-    found: list[Board] = []
+    found: list[Leaderboard] = []
     for name in CLASSES:
-        members = [record for record in current if class_of(record) == name]
+        members = [record for record in current if record_category(record) == name]
         made = _boards(members, current, known, ranked=True)
-        found += [*made, *_aggregate(name, _counted(made))]
+        found += [*made, *_aggregate(name, _aggregate_boards(made))]
     return found
 
 
-def run_boards(records: list[dict[str, Any]], known: Anchors | None = None) -> list[Board]:
+def run_leaderboards(records: list[dict[str, Any]], known: Anchors | None = None,
+                     ) -> list[Leaderboard]:
     """Return the boards of a user's own results, one for each environment and split, without ranks.
 
     Parameters
@@ -275,106 +278,108 @@ def run_boards(records: list[dict[str, Any]], known: Anchors | None = None) -> l
 
 
 def _boards(records: Iterable[dict[str, Any]], timed: list[dict[str, Any]], known: Anchors, *,
-            ranked: bool) -> list[Board]:
+            ranked: bool) -> list[Leaderboard]:
     """Return a board for each split and environment, in the order of registration; ``timed`` are
     the records whose machines are compared."""
-    products = _matrix_products(timed)
-    kinds = [kind_of(id) for id in ids()]
+    products = _matmul_seconds(timed)
+    kinds = [base_environment(id) for id in ids()]
     groups: dict[tuple[Any, ...], list[dict[str, Any]]] = {}
     for record in records:
-        kind = kind_of(record["environment"]["id"])
+        kind = base_environment(record["environment"]["id"])
         place = kinds.index(kind) if kind in kinds else len(kinds)
-        groups.setdefault((_split_order(record), place, world(record),
+        groups.setdefault((_split_order(record), place, world_key(record),
                            record["environment"]["name"]), []).append(record)
     return [_board(groups[key], known, products, ranked=ranked) for key in sorted(groups)]
 
 
 def _split_order(record: dict[str, Any]) -> int:
-    return SPLITS.index(record["split"])
+    return SPLIT_ORDER.index(record["split"])
 
 
 def _board(records: list[dict[str, Any]], known: Anchors, products: dict[str, float], *,
-           ranked: bool) -> Board:
+           ranked: bool) -> Leaderboard:
     """Return the board of one environment, by mean error; unfinished methods come last."""
     environment = records[0]["environment"]["name"]
-    floor = floor_of(records)
+    floor = naive_baseline_record(records)
     shown = [floor] if floor and ranked else records
     seeds = {seed for record in shown for seed in record["seeds"]}
-    zero = errors_of(floor)
+    zero = episode_errors(floor)
     rows = sorted((_row(record, seeds, zero, known, products) for record in records
-                   if not seeds.isdisjoint(record["seeds"])), key=_place)
-    competing = {row.label: {environment: errors_of(row.record)} for row in rows
+                   if not seeds.isdisjoint(record["seeds"])), key=_sort_key)
+    competing = {row.label: {environment: episode_errors(row.record)} for row in rows
                  if not row.cells["note"]}
     ranks = shared_ranks(competing) if competing and ranked else {}
-    return Board(class_of(records[0]), environment, title_of(records[0]), _numbered(rows, ranks))
+    return Leaderboard(record_category(records[0]), environment, environment_title(records[0]),
+                       _with_ranks(rows, ranks))
 
 
-def _numbered(rows: list[Row], ranks: Mapping[str, int | None]) -> list[Row]:
+def _with_ranks(rows: list[MethodRow], ranks: Mapping[str, int | None]) -> list[MethodRow]:
     return [row._replace(cells=row.cells | {"rank": ranks.get(row.label)}, colour=i)
             for i, row in enumerate(rows)]
 
 
 def _row(whole: dict[str, Any], seeds: set[str], zero: dict[str, float], known: Anchors,
-         products: dict[str, float]) -> Row:
+         products: dict[str, float]) -> MethodRow:
     """Return the row of a record on the board with these seeds, without its rank."""
     record = whole | {
         "episodes": [episode for episode in whole["episodes"] if episode["seed"] in seeds],
         "seeds": [seed for seed in whole["seeds"] if seed in seeds]}
-    errors = errors_of(record)
+    errors = episode_errors(record)
     counts = {"failed": sum(episode["status"] != "ok" for episode in whole["episodes"]),
               "missing": len(seeds - set(record["seeds"]))}
     note = [*filter(None, [record["role"]]), *["privileged"] * record["privileged"],
             *(f"{count} {what}" for what, count in counts.items() if count)]
-    cells = _identity(record, record["environment"]["name"], ", ".join(note))
-    cells |= errors_and_gains(errors, zero)
-    cells |= {"seeds": seed_ranges(record["seeds"]), "skill": _skill(record, known)}
+    cells = _identity_cells(record, record["environment"]["name"], ", ".join(note))
+    cells |= error_and_skill(errors, zero)
+    cells |= {"seeds": seed_ranges(record["seeds"]), "skill": _normalised_score(record, known)}
     for name in (scores() | scores("measured")).keys() - {"error"}:
         values = list(scores_by_seed(record, name).values())
         reduce: Any = min if name == "seconds_per_step" else np.mean
         cells[name] = float(reduce(values)) if values else None
     cells |= _costs(record, products)
-    return Row(cells, record, gains_over(zero, errors))
+    return MethodRow(cells, record, skill_scores(zero, errors))
 
 
-def _identity(record: dict[str, Any], environment: str, note: str) -> dict[str, Any]:
-    return {"class": class_of(record), "environment": environment, "note": note, "rank": None,
+def _identity_cells(record: dict[str, Any], environment: str, note: str) -> dict[str, Any]:
+    return {"class": record_category(record), "environment": environment, "note": note,
+            "rank": None,
             **{name: record[name] for name in ("method", "version", "title", "official")}}
 
 
-def _place(row: Row) -> tuple[bool, float, str]:
+def _sort_key(row: MethodRow) -> tuple[bool, float, str]:
     error = row.cells["error"]
     return not row.complete, math.inf if error is None else error, row.label
 
 
-def floor_of(records: Iterable[dict[str, Any]]) -> dict[str, Any] | None:
+def naive_baseline_record(records: Iterable[dict[str, Any]]) -> dict[str, Any] | None:
     """Return the record from which gains are counted, of those of one environment, if any."""
-    return max(filter(is_floor, records), default=None,
+    return max(filter(is_naive_baseline, records), default=None,
                key=lambda record: (record["official"], finished(record)))
 
 
-def is_floor(record: dict[str, Any]) -> bool:
+def is_naive_baseline(record: dict[str, Any]) -> bool:
     """Return whether it is a record of the built-in floor: third-party versions are no numbers."""
     return (record["method"] == FLOORS[track_of_board(record["board"])]
             and version_number(record["version"]) is not None)
 
 
-def errors_of(record: dict[str, Any] | None) -> dict[str, float]:
+def episode_errors(record: dict[str, Any] | None) -> dict[str, float]:
     """Return seed -> ẽ_c of a record; nothing without one."""
     return scores_by_seed(record, "error") if record else {}
 
 
-def gains_over(zero: dict[str, float], errors: dict[str, float]) -> dict[str, float]:
+def skill_scores(zero: dict[str, float], errors: dict[str, float]) -> dict[str, float]:
     """Return seed -> gain over the errors ``zero`` of the floor, of the shared seeds."""
     return {seed: 1.0 - error / zero[seed] for seed, error in errors.items() if zero.get(seed)}
 
 
-def errors_and_gains(errors: dict[str, float], zero: dict[str, float]) -> dict[str, float | None]:
+def error_and_skill(errors: dict[str, float], zero: dict[str, float]) -> dict[str, float | None]:
     """Return mean error and interquartile mean gain of one environment, with their intervals."""
-    return (_with_ends("error", {"": errors}, mean_over_environments)
-            | _with_ends("gain", {"": gains_over(zero, errors)}, interquartile_mean))
+    return (_with_interval("error", {"": errors}, mean_over_environments)
+            | _with_interval("gain", {"": skill_scores(zero, errors)}, interquartile_mean))
 
 
-def _with_ends(name: str, values: dict[str, dict[str, float]],
+def _with_interval(name: str, values: dict[str, dict[str, float]],
                statistic: Any) -> dict[str, float | None]:
     """Return a statistic of environment -> seed -> score, ``name``, and the ends of its 95 %
     interval, ``name_low`` and ``name_high``; None where unknown."""
@@ -389,51 +394,53 @@ def _with_ends(name: str, values: dict[str, dict[str, float]],
 # -- aggregates ------------------------------------------------------------------------------------
 
 
-def counted() -> set[str]:
+def aggregate_environments() -> set[str]:
     """Return the names of the environments of aggregates: all registered ids with their default
     arguments, without shifts, which have a board of their own."""
     return {named(id, {}) for id in ids() if not home_of(id)}
 
 
-def _counted(made: list[Board]) -> list[Board]:
+def _aggregate_boards(made: list[Leaderboard]) -> list[Leaderboard]:
     """Return the boards of an aggregate: with a floor; with an official floor where there is any,
     otherwise a third-party floor could exclude all other methods."""
-    names = counted()
+    names = aggregate_environments()
     own = [board for board in made if board.environment in names
-           and any(row.gains for row in board.rows)]
+           and any(row.skill_scores for row in board.rows)]
     return [board for board in own if any(
-        is_floor(record) and record["official"] for record in board.records)] or own
+        is_naive_baseline(record) and record["official"] for record in board.records)] or own
 
 
-def _aggregate(of_class: str, made: list[Board]) -> list[Board]:
+def _aggregate(category: str, made: list[Leaderboard]) -> list[Leaderboard]:
     """Return the methods that have finished all of several environments, ordered and ranked by the
     interquartile mean of their gains."""
     if len(made) < 2:
         return []
-    found = [{row.label: row for row in board.rows if row.complete and row.gains}
+    found = [{row.label: row for row in board.rows if row.complete and row.skill_scores}
              for board in made]
     rows = []
     competing = {}
     for label in set.intersection(*map(set, found)):
         own = [each[label] for each in found]
-        gains = {board.environment: row.gains for board, row in zip(made, own, strict=True)}
+        gains = {board.environment: row.skill_scores for board, row in zip(made, own, strict=True)}
         note = ", ".join(dict.fromkeys(word for row in own for word in row.badges))
         assert own[0].record is not None
-        rows.append(Row(dict.fromkeys(fields()) | _identity(own[0].record, ALL, note)
-                        | _with_ends("gain", gains, interquartile_mean)
-                        | {"official": all(row.cells["official"] for row in own)}))
+        rows.append(MethodRow(
+            dict.fromkeys(csv_fields()) | _identity_cells(own[0].record, ALL, note)
+            | _with_interval("gain", gains, interquartile_mean)
+            | {"official": all(row.cells["official"] for row in own)}))
         if not note:
             competing[label] = gains
     ranks = shared_ranks(competing, statistic=interquartile_mean,
                          higher_is_better=True) if competing else {}
     rows.sort(key=lambda row: (-row.cells["gain"], row.cells["method"], row.cells["version"]))
-    return [Board(of_class, ALL, "All environments", _numbered(rows, ranks))] if rows else []
+    board = Leaderboard(category, ALL, "All environments", _with_ranks(rows, ranks))
+    return [board] if rows else []
 
 
 # -- records ---------------------------------------------------------------------------------------
 
 
-def read_for_boards(folder: Path) -> tuple[list[dict[str, Any]], list[str]]:
+def read_leaderboard_records(folder: Path) -> tuple[list[dict[str, Any]], list[str]]:
     """Return the records of a folder that boards show, and one sentence for each record that no
     board can show.
 
@@ -464,27 +471,28 @@ def anchors(records: Iterable[dict[str, Any]]) -> Anchors:
     found: dict[tuple[str, str, str], dict[str, Any]] = {}
     for record in records:
         # a third-party method of that name is no anchor
-        if record["method"] in ANCHORS and version_number(record.get("version", "v1")):
-            key = (record["method"], world(record), record["split"])
+        if record["method"] in SKILL_ANCHORS and version_number(record.get("version", "v1")):
+            key = (record["method"], world_key(record), record["split"])
             found[key] = max(found.get(key, record), record, key=lambda other: (
                 other["official"], BOARDS.index(other["board"]), finished(other)))
     return {key: scores_by_seed(record, "error") for key, record in found.items()}
 
 
-def shipped_anchors(records: Iterable[dict[str, Any]]) -> Anchors:
+def bundled_anchors(records: Iterable[dict[str, Any]]) -> Anchors:
     """Return the `anchors` of the worlds of these records among the records of the package."""
-    kinds = {kind_of(record["environment"]["id"]) for record in records}
-    known = [id.replace("/", "-") for id in ids("estimation") if kind_of(id) in kinds]
+    kinds = {base_environment(record["environment"]["id"]) for record in records}
+    known = [id.replace("/", "-") for id in ids("estimation") if base_environment(id) in kinds]
     published = read_episode_table(table_beside(shipped("leaderboards") / "results"))
-    return anchors(record for record in published if record["method"] in ANCHORS
+    return anchors(record for record in published if record["method"] in SKILL_ANCHORS
                    and record["environment"]["name"] in known)
 
 
-def _skill(record: dict[str, Any], known: Anchors) -> float | None:
+def _normalised_score(record: dict[str, Any], known: Anchors) -> float | None:
     """Return (E_h − E)/(E_h − E_s) of the means over the seeds that all three have; None without
     any."""
     own = scores_by_seed(record, "error")
-    floor, reference = (known.get((name, world(record), record["split"]), {}) for name in ANCHORS)
+    floor, reference = (known.get((name, world_key(record), record["split"]), {})
+                        for name in SKILL_ANCHORS)
     # the last digit of a sum depends on its order
     shared = sorted(own.keys() & floor.keys() & reference.keys())
     if not shared:
@@ -494,7 +502,7 @@ def _skill(record: dict[str, Any], known: Anchors) -> float | None:
     return skill(e, high, low) if high != low else None
 
 
-def _matrix_products(records: Iterable[dict[str, Any]]) -> dict[str, float]:
+def _matmul_seconds(records: Iterable[dict[str, Any]]) -> dict[str, float]:
     """Return processor -> time of a matrix product in s: the median of the runs, official ones
     where there are any, since a single one depends on the load."""
     timed: dict[str, dict[bool, list[float]]] = {}

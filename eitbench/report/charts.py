@@ -18,13 +18,13 @@ from markupsafe import Markup
 from eitbench._foreign import cleaned
 
 WIDTH, HEIGHT, LEFT, RIGHT, TOP, BOTTOM = 860, 360, 76, 30, 12, 46
-COLOURS = 12
+N_COLOURS = 12
 """--c0 … --c11 of the style sheet; further series repeat them, dashed."""
-CELL = 96
+CELL_WIDTH_PX = 96
 """Width of a drawing in a table's cell, px."""
-LETTER = 7.0
+CHAR_WIDTH = 7.0
 """Approximate width of a character, px."""
-MAX_NAME_CHARS = 36
+MAX_POINT_LABEL_CHARS = 36
 """Characters of a name in a chart; titles, legends and tables have whole names."""
 
 
@@ -39,14 +39,14 @@ class Series(NamedTuple):
     faint: bool = False
 
 
-class Point(NamedTuple):
-    """One mark of a `front`."""
+class ParetoPoint(NamedTuple):
+    """One mark of a `pareto_chart`."""
 
     name: str
     colour: int
     x: float
     y: float
-    competes: bool = True
+    is_ranked: bool = True
     """Whether it may be on the front."""
 
 
@@ -91,7 +91,7 @@ class Axis:
         return [round(i * step, 12) for i in range(first, last + 1)]
 
 
-def lines(x: np.ndarray, series: Sequence[Series], x_label: str, y_label: str, *,
+def line_chart(x: np.ndarray, series: Sequence[Series], x_label: str, y_label: str, *,
           log: bool = False) -> Markup:
     """Draw curves over a linear or logarithmic x axis and a logarithmic y axis; a series may end
     before ``x``, and NaN are left out."""
@@ -106,8 +106,8 @@ def lines(x: np.ndarray, series: Sequence[Series], x_label: str, y_label: str, *
     return Markup("".join([*parts, "</svg>"]))
 
 
-def front(points: Sequence[Point], x_label: str, y_label: str) -> Markup:
-    """Draw marks over two logarithmic axes, where small is good; `optimal` ones are filled and
+def pareto_chart(points: Sequence[ParetoPoint], x_label: str, y_label: str) -> Markup:
+    """Draw marks over two logarithmic axes, where small is good; `pareto_front` ones are filled and
     joined. Names stand beside their marks where there is room."""
     def axis(values: list[float], begin: float, end: float) -> Axis:
         positive = [value for value in values if value > 0] or [1.0]  # a zero is at the edge
@@ -115,7 +115,7 @@ def front(points: Sequence[Point], x_label: str, y_label: str) -> Markup:
 
     px = axis([p.x for p in points], LEFT, WIDTH - RIGHT)
     py = axis([p.y for p in points], HEIGHT - BOTTOM, TOP)
-    best = optimal(points)
+    best = pareto_front(points)
     parts = [*_frame(px, py, x_label, y_label),
              _polyline("front", [(px(p.x), py(p.y)) for p in best])]
     taken = [(px(p.x) - 6, py(p.y) - 6, px(p.x) + 6, py(p.y) + 6) for p in points]
@@ -127,57 +127,59 @@ def front(points: Sequence[Point], x_label: str, y_label: str) -> Markup:
         fill = colour if p in best else "var(--card)"
         parts.append(f'<circle style="fill:{fill};stroke:{colour};stroke-width:2" '
                      f'cx="{px(p.x):.1f}" cy="{py(p.y):.1f}" r="5">'
-                     f'{_title(f"{p.name}: {p.x:.3g}, {p.y:.3g}")}</circle>')
-        name = shortened(p.name, MAX_NAME_CHARS)
-        if place := _room(px(p.x), py(p.y), LETTER * len(name), taken):
+                     f'{_svg_title(f"{p.name}: {p.x:.3g}, {p.y:.3g}")}</circle>')
+        name = truncate(p.name, MAX_POINT_LABEL_CHARS)
+        if place := _free_position(px(p.x), py(p.y), CHAR_WIDTH * len(name), taken):
             parts.append(_text(*place, name, "name"))
     return Markup("".join([*parts, "</svg>"]))
 
 
-def optimal(points: Iterable[Point]) -> list[Point]:
+def pareto_front(points: Iterable[ParetoPoint]) -> list[ParetoPoint]:
     """Return the competing points that no other beats in both coordinates, by x."""
-    best: list[Point] = []
-    for p in sorted((p for p in points if p.competes), key=lambda p: (p.x, p.y)):
+    best: list[ParetoPoint] = []
+    for p in sorted((p for p in points if p.is_ranked), key=lambda p: (p.x, p.y)):
         if not best or p.y < best[-1].y:
             best.append(p)
     return best
 
 
-def legend(series: Iterable[Series | Point]) -> list[tuple[int, bool, str]]:
+def legend(series: Iterable[Series | ParetoPoint]) -> list[tuple[int, bool, str]]:
     """Return the legend of series or points."""
-    return [(s.colour % COLOURS, s.colour >= COLOURS, s.name) for s in series]
+    return [(s.colour % N_COLOURS, s.colour >= N_COLOURS, s.name) for s in series]
 
 
-def cell(three: tuple[float, float, float], px: Axis, *, mark: float | None = None,
+def sparkline(three: tuple[float, float, float], px: Axis, *, mark: float | None = None,
          each: Iterable[float] = ()) -> Markup:
     """Draw a dot and its interval for a table's cell, on the axis of its column, with a line at
     ``mark`` and a stroke for ``each`` value of a mean. Hidden from screen readers: the number
     beside it says the same."""
     value, a, b = (min(end if math.isfinite(end) else three[0], px.high) for end in three)
     strokes = "".join(f"M{px(min(one, px.high)):.1f} 2V12" for one in each)
-    return Markup(f'<svg class="cell" viewBox="0 0 {CELL} 14" aria-hidden="true">{_mark(px, mark)}'
+    return Markup(f'<svg class="cell" viewBox="0 0 {CELL_WIDTH_PX} 14" aria-hidden="true">'
+                  f'{_vertical_line(px, mark)}'
                   f'<line x1="{px(a):.1f}" x2="{px(b):.1f}" y1="7" y2="7"/>'
                   + (f'<path class="each" d="{strokes}"/>' if strokes else "")
                   + f'<circle cx="{px(value):.1f}" cy="7" r="3"/></svg>')
 
 
-def cell_axis(px: Axis, *, mark: float | None = None) -> Markup:
-    """Draw the axis of a column of `cell`s, with a number at its first and its last tick."""
+def sparkline_axis(px: Axis, *, mark: float | None = None) -> Markup:
+    """Draw the axis of a column of `sparkline`s, with a number at its first and its last tick."""
     ticks = px.ticks()
     strokes = "".join(f"M{px(tick):.1f} 0V4" for tick in ticks)
-    far = len(ticks) > 1 and px(ticks[-1]) - px(ticks[0]) > 0.5 * CELL
-    labels = "".join(_text(px(tick), 14, "middle", _tick(tick).replace("-", "−"))
+    far = len(ticks) > 1 and px(ticks[-1]) - px(ticks[0]) > 0.5 * CELL_WIDTH_PX
+    labels = "".join(_text(px(tick), 14, "middle", _format_tick(tick).replace("-", "−"))
                      for tick in (ticks[:1] if far else []) + ticks[-1:])
-    return Markup(f'<svg class="cell axis" viewBox="0 0 {CELL} 16" aria-hidden="true"><path d="'
-                  f'M{px.begin} 0H{px.end}{strokes}"/>{_mark(px, mark, 6)}{labels}</svg>')
+    return Markup(f'<svg class="cell axis" viewBox="0 0 {CELL_WIDTH_PX} 16" aria-hidden="true">'
+                  f'<path d="M{px.begin} 0H{px.end}{strokes}"/>{_vertical_line(px, mark, 6)}'
+                  f'{labels}</svg>')
 
 
-def shortened(name: str, letters: int) -> str:
+def truncate(name: str, letters: int) -> str:
     """Return a name of so many characters at most."""
     return name if len(name) <= letters else f"{name[:letters - 1].rstrip()}…"
 
 
-def _mark(px: Axis, mark: float | None, height: float = 14) -> str:
+def _vertical_line(px: Axis, mark: float | None, height: float = 14) -> str:
     """Draw a line across a cell, if it is on the axis."""
     if mark is None or not px.low <= mark <= px.high:
         return ""
@@ -191,10 +193,10 @@ def _frame(px: Axis, py: Axis, x_label: str, y_label: str) -> list[str]:
     parts = [f'<svg viewBox="0 0 {WIDTH} {HEIGHT}" role="img" aria-label="{label}">']
     for tick in py.ticks():
         parts += [_polyline("grid", [(LEFT, py(tick)), (WIDTH - RIGHT, py(tick))]),
-                  _text(LEFT - 8, py(tick) + 4, "end", _tick(tick))]
+                  _text(LEFT - 8, py(tick) + 4, "end", _format_tick(tick))]
     for tick in px.ticks():
         parts += [_polyline("grid", [(px(tick), bottom), (px(tick), bottom + 5)]),
-                  _text(px(tick), bottom + 18, "middle", _tick(tick))]
+                  _text(px(tick), bottom + 18, "middle", _format_tick(tick))]
     return [*parts, _text((LEFT + WIDTH - RIGHT) / 2, HEIGHT - 6, "middle", x_label),
             f'<text text-anchor="middle" transform="translate(14 {(bottom + TOP) / 2}) '
             f'rotate(-90)">{escape(y_label)}</text>']
@@ -206,7 +208,7 @@ def _text(x: float, y: float, anchor: str, words: str, kind: str = "") -> str:
             f'{escape(cleaned(words))}</text>')
 
 
-def _title(words: str) -> str:
+def _svg_title(words: str) -> str:
     return f"<title>{escape(cleaned(words))}</title>"
 
 
@@ -216,21 +218,21 @@ def _polyline(kind: str, places: Sequence[tuple[float, float]], colour: int | No
     points = " ".join(f"{x:.1f},{y:.1f}" for x, y in places)
     if colour is None:
         return f'<polyline class="{kind}" points="{points}"/>'
-    dashes = ";stroke-dasharray:6 3" if colour >= COLOURS else ""
+    dashes = ";stroke-dasharray:6 3" if colour >= N_COLOURS else ""
     return (f'<polyline class="{kind}" style="stroke:{_colour(colour)}{dashes}" points="{points}">'
-            f'{_title(title)}</polyline>')
+            f'{_svg_title(title)}</polyline>')
 
 
 def _colour(number: int) -> str:
-    return f"var(--c{number % COLOURS})"
+    return f"var(--c{number % N_COLOURS})"
 
 
-def _tick(tick: float) -> str:
+def _format_tick(tick: float) -> str:
     """``200,000`` and ``0.002``, never ``2e+05``."""
     return f"{tick:,.0f}" if abs(tick) >= 1e4 else f"{tick:g}"
 
 
-def _room(x: float, y: float, width: float, taken: list[tuple[float, float, float, float]]
+def _free_position(x: float, y: float, width: float, taken: list[tuple[float, float, float, float]]
           ) -> tuple[float, float, str] | None:
     """Return where a name of this width fits beside (x, y) clear of ``taken``, to which it is
     added."""
@@ -238,7 +240,8 @@ def _room(x: float, y: float, width: float, taken: list[tuple[float, float, floa
                            (-6, -9, "end"), (-6, 18, "end")):
         left = x + dx - width * (anchor == "end")
         right, top, bottom = left + width, y + dy - 11, y + dy + 3
-        inside = left > LEFT and right < WIDTH - 2 * LETTER and top > 0 and bottom < HEIGHT - BOTTOM
+        inside = (left > LEFT and right < WIDTH - 2 * CHAR_WIDTH and top > 0
+                  and bottom < HEIGHT - BOTTOM)
         if inside and not any(left < b[2] and b[0] < right and top < b[3] and b[1] < bottom
                               for b in taken):
             taken.append((left, top, right, bottom))

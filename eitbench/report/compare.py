@@ -23,20 +23,20 @@ from eitbench.bench.statistics import (
 from eitbench.bench.table import NOTHING, Cell, Table, number_cell
 from eitbench.bench.text import scores_by_seed, with_interval
 from eitbench.bench.tracks import CLASSES
-from eitbench.report.boards import class_of, gains_over, is_floor
+from eitbench.report.boards import is_naive_baseline, record_category, skill_scores
 
-FIELDS = ("environment", "score", "episodes", "a", "b", "difference", "low", "high",
+COMPARISON_FIELDS = ("environment", "score", "episodes", "a", "b", "difference", "low", "high",
           "better", "better_low", "better_high")
-GAIN = "gain"
+SKILL_SCORE = "gain"
 """Score over several environments instead of the error, whose mean the largest would dominate: 1 −
 ẽ_c over that of the floor in the same episode, as on the boards."""
-SHIPPED = shipped("leaderboards") / "results"
+BUNDLED_RECORDS = shipped("leaderboards") / "results"
 """Records of the package."""
-MIN_VERSION_DIGITS = 4
+MIN_VERSION_PREFIX = 4
 """Least number of first digits of a sha256 that name a version."""
 
 
-def find(name: str, folder: Path) -> list[dict[str, Any]]:
+def find_records(name: str, folder: Path) -> list[dict[str, Any]]:
     """Return the records of a method from the path of one, or from METHOD or METHOD@VERSION within
     a folder, otherwise among those of the package. Without a version the newest, official ones
     where there are any; a third-party version may be shortened to four digits.
@@ -51,11 +51,11 @@ def find(name: str, folder: Path) -> list[dict[str, Any]]:
     method, _, version = name.partition("@")
 
     def fits(own: str) -> bool:
-        shortened = version_number(own) is None and len(version) >= MIN_VERSION_DIGITS
+        shortened = version_number(own) is None and len(version) >= MIN_VERSION_PREFIX
         return own == version or (shortened and own.startswith(version))
 
     known: set[str] = set()
-    for place in dict.fromkeys([folder.resolve(), SHIPPED.resolve()]):
+    for place in dict.fromkeys([folder.resolve(), BUNDLED_RECORDS.resolve()]):
         there = read_records(place)
         known |= {record["method"] for record in there}
         own = [record for record in (there if version else newest(there)[0])
@@ -71,7 +71,7 @@ def find(name: str, folder: Path) -> list[dict[str, Any]]:
     raise ValueError(f"there is no record of {name} in {folder}" + _check.nearest(method, known))
 
 
-def comparable(name: str) -> Score:
+def resolve_score(name: str) -> Score:
     """Return the score of this name; ``ValueError`` if none has a better direction."""
     known = {each.name: each for each in scores().values() if each.better in ("lower", "higher")}
     if name not in known:
@@ -80,12 +80,12 @@ def comparable(name: str) -> Score:
     return known[name]
 
 
-def floors(folder: Path) -> list[dict[str, Any]]:
+def naive_baseline_records(folder: Path) -> list[dict[str, Any]]:
     """Return the records from which gains are counted: of the package, and of a folder, which
     precede."""
-    folders = dict.fromkeys([SHIPPED.resolve(), folder.resolve()])
-    there = [record for each in folders for record in read_records(each) if is_floor(record)]
-    return newest(there)[0]
+    folders = dict.fromkeys([BUNDLED_RECORDS.resolve(), folder.resolve()])
+    return newest([record for each in folders for record in read_records(each)
+                   if is_naive_baseline(record)])[0]
 
 
 def compare(a: list[dict[str, Any]], b: list[dict[str, Any]], score: str = "error",
@@ -99,8 +99,8 @@ def compare(a: list[dict[str, Any]], b: list[dict[str, Any]], score: str = "erro
     Returns
     -------
     DataFrame
-        environment, score (or `GAIN`), episodes; a, b: means; difference: of a − b, with the ends
-        of its 95 % interval; better: fraction of episodes in which a is better (an equal score
+        environment, score (or `SKILL_SCORE`), episodes; a, b: means; difference: a − b, with the
+        ends of its 95 % interval; better: fraction of episodes in which a is better (an equal score
         counts ½), with the ends of its interval. Over several environments interquartile means of
         gains, or means of the environments' means.
 
@@ -109,14 +109,14 @@ def compare(a: list[dict[str, Any]], b: list[dict[str, Any]], score: str = "erro
     ValueError
         If there is no such score, or no environment in which both have it in an episode.
     """
-    higher = comparable(score).better == "higher"
-    theirs = {_place(record): scores_by_seed(record, score) for record in b}
+    higher = resolve_score(score).better == "higher"
+    theirs = {_environment_and_split(record): scores_by_seed(record, score) for record in b}
     both: dict[str, tuple[dict[str, float], dict[str, float]]] = {}
     gains: dict[str, dict[str, Any]] = {kind: {} for kind in CLASSES}
-    levels = {_place(record): scores_by_seed(record, "error") for record in
+    levels = {_environment_and_split(record): scores_by_seed(record, "error") for record in
               sorted(zero, key=lambda record: (record["official"], finished(record)))}
-    for record in sorted(a, key=_place):
-        place = name, split = _place(record)
+    for record in sorted(a, key=_environment_and_split):
+        place = name, split = _environment_and_split(record)
         pair = scores_by_seed(record, score), theirs.get(place, {})
         shared = pair[0].keys() & pair[1].keys()
         if shared:
@@ -124,8 +124,8 @@ def compare(a: list[dict[str, Any]], b: list[dict[str, Any]], score: str = "erro
             own, other = ({seed: each[seed] for seed in shared} for each in pair)
             both[label] = own, other
             level = levels.get(place, {})
-            if gained := gains_over(level, own):
-                gains[class_of(record)][label] = gained, gains_over(level, other)
+            if gained := skill_scores(level, own):
+                gains[record_category(record)][label] = gained, skill_scores(level, other)
     if not both:
         also = f" and have {score}" if score != "error" else ""
         raise ValueError("there is no environment in which both have finished an episode of the "
@@ -133,14 +133,14 @@ def compare(a: list[dict[str, Any]], b: list[dict[str, Any]], score: str = "erro
     rows = [_row(label, score, {label: pair}, mean_over_environments, higher=higher)
             for label, pair in both.items()]
     if score == "error":
-        rows += [_row(f"all {kind}", GAIN, together, interquartile_mean, higher=True)
+        rows += [_row(f"all {kind}", SKILL_SCORE, together, interquartile_mean, higher=True)
                  for kind, together in gains.items() if len(together) > 1]
     elif len(both) > 1:
         rows.append(_row("all", score, both, mean_over_environments, higher=higher))
-    return pd.DataFrame(rows, columns=list(FIELDS))
+    return pd.DataFrame(rows, columns=list(COMPARISON_FIELDS))
 
 
-def _place(record: dict[str, Any]) -> tuple[str, str]:
+def _environment_and_split(record: dict[str, Any]) -> tuple[str, str]:
     return record["environment"]["name"], record["split"]
 
 
@@ -154,20 +154,20 @@ def _row(label: str, score: str, pairs: dict[str, Any], statistic: Statistic, *,
             *paired_probability_of_improvement(ours, theirs, higher_is_better=higher))
 
 
-def names(a: dict[str, Any], b: dict[str, Any]) -> tuple[str, str]:
+def display_names(a: dict[str, Any], b: dict[str, Any]) -> tuple[str, str]:
     """Return the names of two records' methods, with versions if they are the same."""
     if a["method"] != b["method"]:
         return a["method"], b["method"]
     return f"{a['method']}@{a['version']}", f"{b['method']}@{b['version']}"
 
 
-def shown(table: pd.DataFrame, a: str, b: str, score: str = "error") -> Table:
+def comparison_table(table: pd.DataFrame, a: str, b: str, score: str = "error") -> Table:
     """Return the comparison of methods named ``a`` and ``b``, with a verdict: the better one where
     the interval of the difference excludes zero."""
-    asked = comparable(score)
+    asked = resolve_score(score)
     rows = []
     for row in table.to_dict("records"):
-        is_gain = row["score"] == GAIN
+        is_gain = row["score"] == SKILL_SCORE
         less, more = (b, a) if is_gain or asked.better == "higher" else (a, b)
         three = with_interval(row["difference"], row["low"], row["high"])
         share = f"{100 * row['better']:.0f} %"
@@ -176,7 +176,7 @@ def shown(table: pd.DataFrame, a: str, b: str, score: str = "error") -> Table:
         levels = {f"{asked.heading} of {name}": number_cell(row[key])
                   for key, name in (("a", a), ("b", b))}
         if is_gain:
-            levels = {key: cell._replace(text=f"{GAIN} {cell.text}")
+            levels = {key: cell._replace(text=f"{SKILL_SCORE} {cell.text}")
                       for key, cell in levels.items()}
         rows.append({
             "environment": row["environment"].removeprefix("eitbench-"),
@@ -187,9 +187,9 @@ def shown(table: pd.DataFrame, a: str, b: str, score: str = "error") -> Table:
     return Table.of(rows, label="Comparison", keep=list(rows[0]))
 
 
-def in_terminal(table: pd.DataFrame, a: str, b: str, score: str, width: int) -> str:
+def format_comparison(table: pd.DataFrame, a: str, b: str, score: str, width: int) -> str:
     """Return the comparison in lines of ``width`` characters, where the methods are A and B."""
-    whole = shown(table, "A", "B", score)
+    whole = comparison_table(table, "A", "B", score)
     first = ("environment", "verdict", "difference", *whole.headings[3:5], "A better", "episodes")
     fitted = whole.fitted(width, first)
     return "\n\n".join([f"A: {a}\nB: {b}", fitted.markdown(),

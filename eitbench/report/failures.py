@@ -15,7 +15,7 @@ from eitbench.bench.text import seed_ranges
 from eitbench.bench.variants import as_typed, flat
 from eitbench.data.seeds import format_seed
 
-_OPTIONS = {"estimation": "--baseline", "injection": "--policy"}
+_METHOD_OPTIONS = {"estimation": "--baseline", "injection": "--policy"}
 """Track -> the option of `eitbench run` that names its methods."""
 
 
@@ -35,7 +35,8 @@ class Failure(NamedTuple):
             "\n" + textwrap.indent(self.traceback.rstrip(), "  ") if self.traceback else "")
 
 
-def asked_of(records: Iterable[dict[str, Any]], jobs: Iterable[Job]) -> list[dict[str, Any]]:
+def select_requested(records: Iterable[dict[str, Any]], jobs: Iterable[Job],
+                     ) -> list[dict[str, Any]]:
     """Return the records restricted to the episodes of these jobs."""
     asked = {_key(job) for job in jobs}
     found = []
@@ -74,7 +75,7 @@ def debug_command(failure: Failure, jobs: Iterable[Job]) -> str:
                        for number, value in flat(given.get("world", {})).items()]
             estimator = ["--estimator", given["estimator"]] if "estimator" in given else []
             return shlex.join(["eitbench", "run", "--env", job.environment.id,
-                               _OPTIONS[job.environment.track], job.method, "--seeds", first,
+                               _METHOD_OPTIONS[job.environment.track], job.method, "--seeds", first,
                                *changes, *estimator, "--isolate", "none", "--jobs", "1"])
     return ""
 

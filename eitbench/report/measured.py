@@ -22,7 +22,7 @@ from eitbench.envs.rendering import draw_electrodes, draw_field
 from eitbench.measured.calibration import electrode_misfits
 from eitbench.measured.segmentation import ktc_score, require_round_tank, segment
 from eitbench.physics.stationary import StationaryTransport
-from eitbench.report.templates import data_uri, rendered
+from eitbench.report.templates import data_uri, render_template
 
 if TYPE_CHECKING:
     from eitbench.bench.measured import MeasuredRun
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 CLASS_COLOURS = ListedColormap(["#f4f4f2", "#d1495b", "#0b6e75"])
 """Water, resistive, conductive."""
-COLOURS = ("#0b6e75", "#d1495b", "#b8860b", "#7a5195", "#5b6770")
+LINE_COLOURS = ("#0b6e75", "#d1495b", "#b8860b", "#7a5195", "#5b6770")
 CORRECTION_TEXT = {"offset": "The misfit is subtracted from all readings.",
                    "gain": "Each reading is divided by its ratio to the model."}
 MIN_PLOTTED = 1e-2
@@ -47,7 +47,7 @@ def write_report(path: Path, env: MeasuredEnv, runs: Sequence[MeasuredRun],
     `eitbench.measured.segmentation`, the segmentations."""
     source = dict(env.measurements.source)
     calibration = env.calibration
-    page = rendered(
+    page = render_template(
         "measured.html.j2", root="", title=str(source.pop("file", "Measurements")), source=source,
         methods=[(run.method, run.withheld_rmse, run.mean_nis(env.task.warm_up)) for run in runs],
         warnings=env.quality_warnings(),
@@ -179,7 +179,7 @@ def _velocity(env: MeasuredEnv, runs: Sequence[MeasuredRun]) -> str:
 
 def _plot(axes: Axes, env: MeasuredEnv, curves: dict[str, np.ndarray], label: str) -> None:
     """Draw values (T,) of each method over time."""
-    for (method, values), colour in zip(curves.items(), cycle(COLOURS), strict=False):
+    for (method, values), colour in zip(curves.items(), cycle(LINE_COLOURS), strict=False):
         axes.plot(env.measurements.times, values, color=colour, label=method)
     axes.set(xlabel="time / s", ylabel=label)
 
@@ -200,9 +200,9 @@ def _fit(env: MeasuredEnv) -> Figure:
     computed = 1e3 * env.calibration.model_voltages[known]
     ends = [measured.min(), measured.max()]
     values.plot(ends, ends, color="0.8", linewidth=1)
-    values.plot(computed, measured, ".", color=COLOURS[0], markersize=3)
+    values.plot(computed, measured, ".", color=LINE_COLOURS[0], markersize=3)
     values.set(xlabel="model / mV", ylabel="measured / mV")
-    misfit.plot(computed, measured - computed, ".", color=COLOURS[1], markersize=3)
+    misfit.plot(computed, measured - computed, ".", color=LINE_COLOURS[1], markersize=3)
     misfit.axhline(0.0, color="0.8", linewidth=1)
     misfit.set(xlabel="model / mV", ylabel="measured − model / mV")
     return figure
@@ -214,12 +214,12 @@ def _contacts(env: MeasuredEnv) -> Figure:
     figure, (impedance, misfit) = _panels(2, (10.5, 3.2))
     z = 1e3 * calibration.contact_impedance
     number, factor = np.arange(1, len(z) + 1), np.exp(calibration.contact_impedance_std)
-    impedance.errorbar(number, z, [z - z / factor, z * factor - z], fmt="o", color=COLOURS[0],
+    impedance.errorbar(number, z, [z - z / factor, z * factor - z], fmt="o", color=LINE_COLOURS[0],
                        markersize=4, linewidth=1)
     impedance.set(xlabel="electrode", ylabel="contact impedance / (mΩ·m²)", yscale="log")
     misfits = electrode_misfits(calibration, env.measurements.matrix)
     misfits *= 100 / np.nanmean(np.abs(calibration.mean_voltages))
-    misfit.bar(number, misfits, color=COLOURS[1])
+    misfit.bar(number, misfits, color=LINE_COLOURS[1])
     misfit.set(xlabel="electrode", ylabel="misfit of its readings / %\nof the mean reading")
     return figure
 
@@ -230,7 +230,7 @@ def _electrodes(run: MeasuredRun) -> Figure:
     number = np.arange(1, residuals.shape[1] + 1)
     figure, (axes,) = _panels(1, (10.5, 1.6 + 0.09 * len(number)))
     if len(residuals) == 1:
-        axes.bar(number, residuals[0], color=COLOURS[1])
+        axes.bar(number, residuals[0], color=LINE_COLOURS[1])
         axes.set(xlabel="electrode", ylabel="residual of its readings / noise std")
         return figure
     shown = np.log10(np.maximum(residuals.T, 1e-3))

@@ -24,46 +24,47 @@ from eitbench.data.seeds import allow_test_seeds, parse_seeds
 from eitbench.envs.rendering import FIELD_COLORMAP, colour_range, draw_field
 from eitbench.numerics.mesh import Mesh
 from eitbench.report import tables
-from eitbench.report.boards import Board
+from eitbench.report.boards import Leaderboard
 from eitbench.report.failures import failures
 from eitbench.report.sweep import Sweep
-from eitbench.report.templates import data_uri, rendered
+from eitbench.report.templates import data_uri, render_template
 from eitbench.worlds.task import Task
 
-N_PICTURED, N_TIMES = 3, 4
+N_SNAPSHOT_METHODS, N_SNAPSHOT_TIMES = 3, 4
 """Methods and states in the pictures of an episode."""
 
 
-def write_page(store: EpisodeStore, boards: Sequence[Board], sweeps: Sequence[Sweep] = ()) -> Path:
+def write_page(store: EpisodeStore, boards: Sequence[Leaderboard],
+               sweeps: Sequence[Sweep] = ()) -> Path:
     """Write ``index.html``, which needs no other file and no network, and return its path."""
     shown = [tables.run_table(board, drawn=True) for board in boards]
     sections = [{
         "title": board.title,
         "about": tables.run_title(board).removeprefix(f"{board.title}, "),
-        "table": table, "axes": tables.Axes.of(board).drawn(),
+        "table": table, "axes": tables.ScoreAxes.of(board).headers(),
         "curves": tables.curve_chart(board), "snapshots": _snapshots(store, board),
         "failures": [(failure.record["title"], seed_ranges(failure.seeds), failure.message,
                       failure.traceback) for failure in failures(store, board.records)],
     } for board, table in zip(boards, shown, strict=True)]
     runs = [run for board in boards for record in board.records for run in record["runs"]]
-    html = rendered(
+    html = render_template(
         "page.html.j2", root="", sections=sections, explanations=tables.explanations(shown),
         sweeps=[(sweep, sweep.chart()) for sweep in sweeps],
-        colour_bar=_bare(3.0, 0.12, lambda axes: axes.imshow(np.linspace(0, 1, 256)[None],
-                                                             cmap=FIELD_COLORMAP, aspect="auto")),
+        colour_bar=_draw_bare(3.0, 0.12, lambda axes: axes.imshow(
+            np.linspace(0, 1, 256)[None], cmap=FIELD_COLORMAP, aspect="auto")),
         runs=[group[0] for group in alike(runs, "command")])
     path = store.folder / "index.html"
     write_atomically(path, html)
     return path
 
 
-def _snapshots(store: EpisodeStore, board: Board) -> dict[str, Any] | None:
+def _snapshots(store: EpisodeStore, board: Leaderboard) -> dict[str, Any] | None:
     """Return truth and estimates of the best methods but floors in one episode, as PNG data; None
     if their estimates are missing or do not fit the states."""
     chosen = [(row, {episode["seed"] for episode in row.record["episodes"]
                      if episode["status"] == "ok"})
               for row in board.rows if row.record and "floor" not in row.badges]
-    chosen = [(row, seeds) for row, seeds in chosen if seeds][:N_PICTURED]
+    chosen = [(row, seeds) for row, seeds in chosen if seeds][:N_SNAPSHOT_METHODS]
     shared = sorted(set.intersection(*(seeds for _, seeds in chosen))) if chosen else []
     if not shared:
         return None
@@ -86,7 +87,7 @@ def _snapshots(store: EpisodeStore, board: Board) -> dict[str, Any] | None:
                       "another shape than its states", stacklevel=2)
         return None
     truth = env.truth()
-    times = task.warm_up + np.linspace(0.12, 0.88, N_TIMES) * (task.n_steps - task.warm_up)
+    times = task.warm_up + np.linspace(0.12, 0.88, N_SNAPSHOT_TIMES) * (task.n_steps - task.warm_up)
     rows = [(f"t = {1e3 * t * task.transport.time_step:.0f} ms",
              [_picture(task, env.truth_mesh(), truth[t - 1]),
               *(_picture(task, task.mesh, field[t - 1]) for field in fields)])
@@ -116,11 +117,11 @@ def _picture(task: Task, mesh: Mesh, values: np.ndarray) -> str:
     extent = np.ptp(mesh.points, axis=0)
     length, height = (extent[2], extent[1]) if mesh.dim == 3 else extent
     width = 2.6 if _is_tank(task) else 4.0  # inches; the style sheet keeps tanks small too
-    return _bare(width, width * height / length,
+    return _draw_bare(width, width * height / length,
                  lambda axes: draw_field(axes, mesh, values, *colour_range(task)))
 
 
-def _bare(width: float, height: float, draw: Callable[[Axes], object]) -> str:
+def _draw_bare(width: float, height: float, draw: Callable[[Axes], object]) -> str:
     """Draw on axes of this size in inches without frame and background."""
     figure = Figure(figsize=(width, height), dpi=90, facecolor="none")
     axes = figure.add_axes((0, 0, 1, 1), facecolor="none")

@@ -25,7 +25,7 @@ from eitbench.envs.rendering import colour_range, draw_electrodes, draw_field
 from eitbench.numerics.mesh import Mesh
 from eitbench.worlds.task import Task
 
-LABEL = "concentration / (mol/m³)"
+FIELD_LABEL = "concentration / (mol/m³)"
 
 
 def field(task: Task, c: Any, ax: Axes | None = None, *, currents: Any = None,
@@ -60,7 +60,7 @@ def field(task: Task, c: Any, ax: Axes | None = None, *, currents: Any = None,
     if ax is None:
         import matplotlib.pyplot as plt
         ax = plt.subplots(figsize=_size(task, 1, 1), layout="constrained")[1]
-    _draw(ax, task, task.mesh, values, current, colour_bar=colour_bar)
+    _draw_panel(ax, task, task.mesh, values, current, colour_bar=colour_bar)
     return ax
 
 
@@ -90,7 +90,7 @@ def episode(method: Any, env: str | gym.Env, seed: int | str, *,
     import matplotlib.pyplot as plt
     asked = environment_of(env, world)
     loaded = method_given(method, asked.track)
-    number = one_seed(seed)
+    number = parse_single_seed(seed)
     made = asked.make()
     if not can_play(loaded, made):
         raise ValueError(f"method {loaded.name} does not play {asked.id}")
@@ -106,13 +106,13 @@ def episode(method: Any, env: str | gym.Env, seed: int | str, *,
     for row, t in zip(axes, wanted, strict=True):
         truth, mean, currents = found[t]
         error = scoring.step_errors((interpolation @ mean)[None], truth[None], mass)[0]
-        last = _draw(row[0], task, mesh, truth, currents)
-        _draw(row[1], task, task.mesh, mean, currents)
+        last = _draw_panel(row[0], task, mesh, truth, currents)
+        _draw_panel(row[1], task, task.mesh, mean, currents)
         row[0].set_title(f"truth, t = {1e3 * t * world_of.time_step:.0f} ms", fontsize=9)
         row[1].set_title(f"{loaded.name}, ẽ_c = {error:.2g}", fontsize=9)
     for ax in axes.flat:
         ax.label_outer()
-    figure.colorbar(last, ax=axes, label=LABEL, extend="both")
+    figure.colorbar(last, ax=axes, label=FIELD_LABEL, extend="both")
     figure.suptitle(f"{asked.id}, {format_seed(number)}", fontsize=10)
     return axes
 
@@ -183,7 +183,7 @@ def logarithmic(ax: Axes, which: Literal["x", "y"]) -> None:
     axis.set_minor_formatter(NullFormatter())
 
 
-def one_seed(seed: int | str) -> int:
+def parse_single_seed(seed: int | str) -> int:
     """Return the number of an episode; ``ValueError`` if it is none or several."""
     if not isinstance(seed, str):
         return _check.integer("seed", seed, low=0)
@@ -193,7 +193,7 @@ def one_seed(seed: int | str) -> int:
     return numbers[0]
 
 
-def played(env: Any, method: Any, seed: int, last: int) -> Iterator[Any]:
+def run_until(env: Any, method: Any, seed: int, last: int) -> Iterator[Any]:
     """Yield what `estimates` or `injections` yields up to the state t = ``last``."""
     states = (injections if isinstance(env, InjectionEnv) else estimates)(env, method, seed)
     for state in tqdm(states, total=last, desc="playing", unit="state", disable=None):
@@ -209,7 +209,7 @@ def states_at(env: Any, method: Any, seed: int, wanted: Collection[int],
     truth = simulate(env.world, seed).concentration
     cycle = env.world.currents
     found = {}
-    for t, said, *_ in played(env, method, seed, max(wanted)):
+    for t, said, *_ in run_until(env, method, seed, max(wanted)):
         if t in wanted:
             mean, currents = ((env.core.estimate()[0][0], said["currents"])
                               if isinstance(env, InjectionEnv)
@@ -218,14 +218,14 @@ def states_at(env: Any, method: Any, seed: int, wanted: Collection[int],
     return found
 
 
-def _draw(ax: Axes, task: Task, mesh: Mesh, values: np.ndarray, currents: np.ndarray, *,
+def _draw_panel(ax: Axes, task: Task, mesh: Mesh, values: np.ndarray, currents: np.ndarray, *,
           colour_bar: bool = False) -> Any:
     drawn = draw_field(ax, mesh, values, *colour_range(task))
     draw_electrodes(ax, task, currents, width=3.0)
     ax.set_xlabel("z / cm" if mesh.dim == 3 else "x / cm")
     if colour_bar:
         assert ax.figure is not None
-        ax.figure.colorbar(drawn, ax=ax, label=LABEL, extend="both")
+        ax.figure.colorbar(drawn, ax=ax, label=FIELD_LABEL, extend="both")
     return drawn
 
 

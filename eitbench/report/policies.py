@@ -12,7 +12,7 @@ import pandas as pd
 from eitbench.bench.run import Job, successful
 from eitbench.bench.scores import scores
 from eitbench.bench.statistics import FEWEST, stratified_bootstrap
-from eitbench.report.tables import agent
+from eitbench.report.tables import agent_name
 
 OPEN_LOOP = ("adjacent", "opposite", "transverse", "best_pair", "best_cycle", "best_currents",
              "schedule")
@@ -30,7 +30,7 @@ def policy_rows(jobs: Sequence[Job], results: Iterable[dict[str, Any]]) -> pd.Da
 def errors_by_policy(rows: pd.DataFrame) -> pd.DataFrame:
     """Return ẽ_c with a row an episode and a column a policy, the best first; policies that failed
     in an episode come last. Agents that differ in their training seed are averaged."""
-    errors = rows.assign(policy=rows["policy"].map(agent)).pivot_table(
+    errors = rows.assign(policy=rows["policy"].map(agent_name)).pivot_table(
         index="seed", columns="policy", values="error")
     return errors[sorted(errors, key=lambda name: (errors[name].isna().any(),
                                                    errors[name].mean()))]

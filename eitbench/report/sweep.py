@@ -11,9 +11,9 @@ from eitbench.bench.table import Table, mean_cell, number_cell
 from eitbench.bench.text import scores_by_seed
 from eitbench.bench.variants import as_typed, flat
 from eitbench.report import charts
-from eitbench.report.boards import kind_of
+from eitbench.report.boards import base_environment
 
-MAX_NAME_CHARS = 30
+MAX_METHOD_CHARS = 30
 
 
 class Sweep(NamedTuple):
@@ -21,7 +21,7 @@ class Sweep(NamedTuple):
 
     title: str
     """World and board."""
-    number: str
+    parameter: str
     """Dotted name, ``instrument.noise_relative``."""
     values: list[Any]
     errors: dict[str, list[list[float]]]
@@ -32,7 +32,7 @@ class Sweep(NamedTuple):
         names = [as_typed(value) for value in self.values]
         cells = {method: [mean_cell(errors) if intervals else number_cell(_mean(errors))
                           for errors in each] for method, each in self.errors.items()}
-        return Table.of(({"method": charts.shortened(method, MAX_NAME_CHARS),
+        return Table.of(({"method": charts.truncate(method, MAX_METHOD_CHARS),
                           **dict(zip(names, each, strict=True))}
                          for method, each in cells.items()), keep=names, label=self.title)
 
@@ -43,7 +43,7 @@ class Sweep(NamedTuple):
             table = self.table(intervals=False)
         fitted = table.fitted(width, table.headings)
         hidden = len(table.headings) - len(fitted.headings)
-        return "\n\n".join([f"{self.title}: ẽ_c for {self.number} =", fitted.markdown(),
+        return "\n\n".join([f"{self.title}: ẽ_c for {self.parameter} =", fitted.markdown(),
                             *[f"no room for {hidden} values"] * bool(hidden)])
 
     def chart(self) -> charts.Chart | None:
@@ -55,7 +55,7 @@ class Sweep(NamedTuple):
                   for i, (method, each) in enumerate(self.errors.items()) if any(each)]
         if not series:
             return None
-        svg = charts.lines(x, series, self.number, "relative error ẽ_c",
+        svg = charts.line_chart(x, series, self.parameter, "relative error ẽ_c",
                            log=bool(x[0] > 0 and x[-1] >= 8 * x[0]))
         return charts.Chart(svg, charts.legend(series))
 
@@ -64,7 +64,7 @@ def _mean(errors: list[float]) -> float:
     return float(np.mean(errors)) if errors else np.nan
 
 
-def swept(worlds: Iterable[dict[str, Any]]) -> str | None:
+def swept_parameter(worlds: Iterable[dict[str, Any]]) -> str | None:
     """Return the one number in which variants differ; None if they do not differ in exactly one."""
     changes = [flat(world) for world in worlds]
     differ = [key for key in changes[0] if len({as_typed(each.get(key)) for each in changes}) > 1]
@@ -78,7 +78,7 @@ def sweeps(records: Iterable[dict[str, Any]], number: str) -> list[Sweep]:
     for record in records:
         value = flat(record["environment"]["kwargs"].get("world", {})).get(number)
         values[as_typed(value)] = value
-        title = f"{kind_of(record['environment']['id'])}, {record['board']}"
+        title = f"{base_environment(record['environment']['id'])}, {record['board']}"
         own = boards.setdefault(title, {}).setdefault(record["method"], {})
         own[as_typed(value)] = list(scores_by_seed(record, "error").values())
 

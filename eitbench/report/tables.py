@@ -20,22 +20,22 @@ from eitbench.bench.table import Row as TableRow
 from eitbench.bench.text import number, scores_by_seed, with_interval
 from eitbench.report import charts
 from eitbench.report.boards import (
-    COSTS,
-    Board,
-    Row,
+    COST_COLUMNS,
+    Leaderboard,
+    MethodRow,
+    column_descriptions,
     columns,
-    errors_and_gains,
-    errors_of,
-    floor_of,
+    episode_errors,
+    error_and_skill,
     headings,
-    meanings,
+    naive_baseline_record,
 )
 
-COMPACT = ("seconds_per_step", "peak_memory")
+INDEX_COLUMNS = ("seconds_per_step", "peak_memory")
 """Numbers beside ranks and intervals in the index; the page of an environment has all."""
-WORST_GAIN = -1.0
+SKILL_AXIS_MIN = -1.0
 """Lower end of the drawn axis of gains: a method twice as bad as the floor."""
-DRAWN = {"error": "ẽ_c", "gain": "gain"}
+INTERVAL_HEADINGS = {"error": "ẽ_c", "gain": "gain"}
 """Score with an interval -> heading."""
 COLUMN_PRIORITY = ("method", "ẽ_c", "withheld RMSE", "skill", "seeds", "NIS/m", "ms/step",
                    "contrast", "ẽ_v")
@@ -46,58 +46,58 @@ MAX_LABEL_CHARS = 30
 # -- trainings -------------------------------------------------------------------------------------
 
 
-class Line(NamedTuple):
+class AgentRow(NamedTuple):
     """One method, or all trainings of an agent."""
 
-    row: Row
-    parts: list[Row]
+    row: MethodRow
+    parts: list[MethodRow]
     """Trainings, the best first; empty unless there are several."""
 
 
-def agent(method: str) -> str:
+def agent_name(method: str) -> str:
     """Return the name of an agent without its training seed."""
     return re.sub(r"_seed\d+$", "", method)
 
 
-def lines(board: Board) -> list[Line]:
+def group_by_agent(board: Leaderboard) -> list[AgentRow]:
     """Return the lines of a board in its order.
 
     The mean is over the ranked trainings, of which there must be two; its interval is over the
     episodes, in each of which the scores of the trainings are averaged.
     """
-    groups: dict[tuple[str, bool], list[Row]] = {}
+    groups: dict[tuple[str, bool], list[MethodRow]] = {}
     for row in board.rows:
         method = row.cells["method"]
-        if agent(method) != method and not row.unranked:
-            groups.setdefault((agent(method), row.cells["official"]), []).append(row)
-    together = [Line(_mean(board, rows), rows) for rows in groups.values()
-                if sum(row.competes for row in rows) > 1]
+        if agent_name(method) != method and not row.unranked:
+            groups.setdefault((agent_name(method), row.cells["official"]), []).append(row)
+    together = [AgentRow(_agent_mean(board, rows), rows) for rows in groups.values()
+                if sum(row.is_ranked for row in rows) > 1]
     if not together:
-        return [Line(row, []) for row in board.rows]
+        return [AgentRow(row, []) for row in board.rows]
     grouped = {row.label for line in together for row in line.parts}
-    together += [Line(row, []) for row in board.rows if row.label not in grouped]
-    return sorted(together, key=lambda line: _place(line.row))
+    together += [AgentRow(row, []) for row in board.rows if row.label not in grouped]
+    return sorted(together, key=lambda line: _sort_key(line.row))
 
 
-def _place(row: Row) -> tuple[bool, float]:
+def _sort_key(row: MethodRow) -> tuple[bool, float]:
     error, gain = row.cells["error"], row.cells["gain"]
     return not row.complete, error if error is not None else math.inf if gain is None else -gain
 
 
-def _mean(board: Board, rows: list[Row]) -> Row:
+def _agent_mean(board: Leaderboard, rows: list[MethodRow]) -> MethodRow:
     """Return the line of an agent; ``last_rank`` is the worst of its trainings."""
-    ranked = [row for row in rows if row.competes]
+    ranked = [row for row in rows if row.is_ranked]
     first, unfinished = ranked[0], len(rows) - len(ranked)
     frame = pd.DataFrame([row.cells for row in ranked])
-    means = frame[[*DRAWN, *headings()]].astype(float).mean()
+    means = frame[[*INTERVAL_HEADINGS, *headings()]].astype(float).mean()
     cells = first.cells | means.astype(object).where(means.notna(), None).to_dict() | dict.fromkeys(
-        f"{name}_{end}" for name in DRAWN for end in ("low", "high"))
-    played = pd.DataFrame([errors_of(row.record) for row in ranked]).dropna(axis=1)
+        f"{name}_{end}" for name in INTERVAL_HEADINGS for end in ("low", "high"))
+    played = pd.DataFrame([episode_errors(row.record) for row in ranked]).dropna(axis=1)
     errors = {str(seed): float(mean) for seed, mean in played.mean().items()}
     if errors:
-        cells |= errors_and_gains(errors, errors_of(floor_of(board.records)))
+        cells |= error_and_skill(errors, episode_errors(naive_baseline_record(board.records)))
     return first._replace(record=None, cells=cells | {
-        "method": agent(first.cells["method"]),
+        "method": agent_name(first.cells["method"]),
         "note": f"{unfinished} of {len(rows)} unfinished" if unfinished else "",
         "title": re.sub(r" trained with seed \d+$", "", first.cells["title"]),
         "version": first.cells["version"] if frame["version"].nunique() == 1 else "",
@@ -107,61 +107,63 @@ def _mean(board: Board, rows: list[Row]) -> Row:
 # -- cells -----------------------------------------------------------------------------------------
 
 
-class Axes(NamedTuple):
+class ScoreAxes(NamedTuple):
     """Drawn axes of intervals: one for each column, with a line at the floor."""
 
     axes: dict[str, charts.Axis]
     marks: dict[str, float | None]
 
     @classmethod
-    def of(cls, board: Board) -> Axes:
+    def of(cls, board: Leaderboard) -> ScoreAxes:
         """Return the axes that the rows of a board share."""
-        floor = floor_of(board.records)
+        floor = naive_baseline_record(board.records)
         zero = next((row.cells["error"] for row in board.rows
                      if floor and row.record is floor), None)
-        return cls({name: _axis(board.rows, name) for name in DRAWN}, {"error": zero, "gain": 0.0})
+        return cls({name: _axis_range(board.rows, name) for name in INTERVAL_HEADINGS},
+                   {"error": zero, "gain": 0.0})
 
-    def cell(self, row: Row, name: str, parts: Sequence[Row] = ()) -> Cell:
+    def cell(self, row: MethodRow, name: str, parts: Sequence[MethodRow] = ()) -> Cell:
         """Return a score with its interval, drawn and written, and the range of the trainings."""
-        value, low, high = row.three(name)
+        value, low, high = row.interval(name)
         if math.isnan(value):
             return Cell(NOTHING)
         text, _, interval = with_interval(value, low, high).partition(" ")
-        each = sorted(part.cells[name] for part in parts if part.competes)
+        each = sorted(part.cells[name] for part in parts if part.is_ranked)
         if each:
             spread = with_interval(value, each[0], each[-1]).partition(" ")[2].strip("()")
             interval += f" each {spread or number(value)}"
-        drawn = charts.cell((value, low, high), self.axes[name], mark=self.marks[name], each=each)
+        drawn = charts.sparkline((value, low, high), self.axes[name], mark=self.marks[name],
+                                 each=each)
         return Cell(text, value, drawn, small=interval.strip())
 
-    def cells(self, row: Row, parts: Sequence[Row] = ()) -> dict[str, Cell]:
+    def cells(self, row: MethodRow, parts: Sequence[MethodRow] = ()) -> dict[str, Cell]:
         """Return heading -> cell of each score with an interval."""
-        return {heading: self.cell(row, name, parts) for name, heading in DRAWN.items()}
+        return {heading: self.cell(row, name, parts) for name, heading in INTERVAL_HEADINGS.items()}
 
-    def drawn(self) -> dict[str, Markup]:
+    def headers(self) -> dict[str, Markup]:
         """Return heading -> the axis of its column, as SVG."""
-        return {heading: charts.cell_axis(self.axes[name], mark=self.marks[name])
-                for name, heading in DRAWN.items()}
+        return {heading: charts.sparkline_axis(self.axes[name], mark=self.marks[name])
+                for name, heading in INTERVAL_HEADINGS.items()}
 
 
-def _axis(rows: Iterable[Row], name: str) -> charts.Axis:
+def _axis_range(rows: Iterable[MethodRow], name: str) -> charts.Axis:
     """Return the axis that holds all intervals of a column: of gains linear, cut at
-    `WORST_GAIN`, else logarithmic."""
-    ends = [end for row in rows for end in row.three(name) if math.isfinite(end)]
+    `SKILL_AXIS_MIN`, else logarithmic."""
+    ends = [end for row in rows for end in row.interval(name) if math.isfinite(end)]
     if name == "gain":
-        low, high = max(min([0.0, *ends]), WORST_GAIN), 1.0
+        low, high = max(min([0.0, *ends]), SKILL_AXIS_MIN), 1.0
     else:
         positive = [end for end in ends if end > 0] or [1.0]
         low, high = min(positive), max(positive)
-    return charts.Axis(low, high, 4, charts.CELL - 4, log=name != "gain")
+    return charts.Axis(low, high, 4, charts.CELL_WIDTH_PX - 4, log=name != "gain")
 
 
-def _numbers(row: Row, names: Iterable[str]) -> dict[str, Cell]:
+def _number_cells(row: MethodRow, names: Iterable[str]) -> dict[str, Cell]:
     known = columns()
     return {known[name][0]: number_cell(row.cells[name]) for name in names}
 
 
-def _rank(row: Row, shared: Counter[int | None]) -> Cell:
+def _rank_cell(row: MethodRow, shared: Counter[int | None]) -> Cell:
     rank = row.cells["rank"]
     if rank is None:
         return Cell(NOTHING)
@@ -171,7 +173,8 @@ def _rank(row: Row, shared: Counter[int | None]) -> Cell:
     return Cell(f"{rank}", float(rank), small="shared" if shared[rank] > 1 else "")
 
 
-def method_cell(row: Row, root: str, parts: Sequence[Row] = (), more: Iterable[str] = ()) -> Cell:
+def method_cell(row: MethodRow, root: str, parts: Sequence[MethodRow] = (),
+                more: Iterable[str] = ()) -> Cell:
     """Return title, name and badges of a method, linked to its page or with its trainings; ``more``
     are further badges."""
     title = row.cells["title"]
@@ -182,49 +185,52 @@ def method_cell(row: Row, root: str, parts: Sequence[Row] = (), more: Iterable[s
                 link=f"{root}methods/{quote(row.cells['method'])}.html")
 
 
-def by_author(row: Row) -> list[str]:
+def author_badges(row: MethodRow) -> list[str]:
     """Return the badge of a self-reported row."""
     return [] if row.cells["official"] else ["self-reported"]
 
 
-def flags(row: Row) -> str:
+def filter_flags(row: MethodRow) -> str:
     """Return the words by which the filters of a page select."""
-    return " ".join([*by_author(row), *["unranked"] * row.unranked])
+    return " ".join([*author_badges(row), *["unranked"] * row.unranked])
 
 
 # -- tables ----------------------------------------------------------------------------------------
 
 
-def page_table(board: Board, root: str, *, compact: bool = False) -> Table:
+def page_table(board: Leaderboard, root: str, *, compact: bool = False) -> Table:
     """Return a board for a page; ``root`` leads from the page to the site's folder."""
-    axes = Axes.of(board)
-    together = lines(board)
-    outperformed = _outperformed(together)
+    axes = ScoreAxes.of(board)
+    together = group_by_agent(board)
+    outperformed = _beaten_oracles(together)
 
-    def cells(row: Row, parts: Sequence[Row], shared: Counter[int | None]) -> dict[str, Cell]:
-        more = [*outperformed.get(row.label, ()), *by_author(row)]
-        return {"rank": _rank(row, shared), "method": method_cell(row, root, parts, more),
-                **axes.cells(row, parts), **_numbers(row, COMPACT if compact else headings())}
+    def cells(row: MethodRow, parts: Sequence[MethodRow], shared: Counter[int | None],
+              ) -> dict[str, Cell]:
+        more = [*outperformed.get(row.label, ()), *author_badges(row)]
+        return {"rank": _rank_cell(row, shared), "method": method_cell(row, root, parts, more),
+                **axes.cells(row, parts),
+                **_number_cells(row, INDEX_COLUMNS if compact else headings())}
 
     of_lines = Counter(line.row.cells["rank"] for line in together)
     of_rows = Counter(row.cells["rank"] for row in board.rows)
     made = Table.of((cells(line.row, line.parts, of_lines) for line in together),
-                    label=board.title, keep=["rank"], flags=[flags(line.row) for line in together])
+                    label=board.title, keep=["rank"],
+                    flags=[filter_flags(line.row) for line in together])
 
-    def part(row: Row) -> TableRow:
+    def part(row: MethodRow) -> TableRow:
         own = cells(row, (), of_rows)
-        return TableRow([own[heading] for heading in made.headings], flags(row))
+        return TableRow([own[heading] for heading in made.headings], filter_flags(row))
 
     return made._replace(rows=[row._replace(parts=tuple(map(part, line.parts)))
                                for row, line in zip(made.rows, together, strict=True)])
 
 
-def _outperformed(together: list[Line]) -> dict[str, list[str]]:
+def _beaten_oracles(together: list[AgentRow]) -> dict[str, list[str]]:
     """Return label of a reference -> a note that competing methods have a smaller error."""
     found = {}
     before: list[str] = []
     for row, _ in together:
-        if row.competes:
+        if row.is_ranked:
             before.append(row.cells["title"])
         elif before and "reference" in row.badges:
             better = before[0] if len(before) == 1 else f"{len(before)} others"
@@ -232,17 +238,17 @@ def _outperformed(together: list[Line]) -> dict[str, list[str]]:
     return found
 
 
-def markdown_table(board: Board) -> Table:
+def markdown_table(board: Leaderboard) -> Table:
     """Return a board as text: one line for each record."""
-    axes = Axes.of(board)
+    axes = ScoreAxes.of(board)
     shared = Counter(row.cells["rank"] for row in board.rows)
     return Table.of([{
-        "rank": _rank(row, shared), "method": method_cell(row, ""), **axes.cells(row),
-        "by": "".join(by_author(row)) or "official",
-        **_numbers(row, headings())} for row in board.rows], keep=["rank"])
+        "rank": _rank_cell(row, shared), "method": method_cell(row, ""), **axes.cells(row),
+        "by": "".join(author_badges(row)) or "official",
+        **_number_cells(row, headings())} for row in board.rows], keep=["rank"])
 
 
-def run_table(board: Board, *, title: str = "title", drawn: bool = False) -> Table:
+def run_table(board: Leaderboard, *, title: str = "title", drawn: bool = False) -> Table:
     """Return the board of a user's own results.
 
     ``title`` is the field that names a method. Intervals are ``drawn``, or ± half the 95 % interval
@@ -250,12 +256,12 @@ def run_table(board: Board, *, title: str = "title", drawn: bool = False) -> Tab
     column if they differ. Policies have the paired difference of their error to that of the best
     one that is not privileged.
     """
-    axes = Axes.of(board)
+    axes = ScoreAxes.of(board)
     best = next((row for row in board.rows if row.complete and "privileged" not in row.badges),
-                None) if board.of_class == "injection" and len(board.rows) > 1 else None
+                None) if board.category == "injection" and len(board.rows) > 1 else None
     seeds = run_seeds(board)
-    others = [name for name in headings(measured=True) if name not in COSTS]
-    is_measured = board.of_class == "measured"
+    others = [name for name in headings(measured=True) if name not in COST_COLUMNS]
+    is_measured = board.category == "measured"
     if is_measured:
         others.remove("prediction_error")
     rows = []
@@ -271,49 +277,50 @@ def run_table(board: Board, *, title: str = "title", drawn: bool = False) -> Tab
         elif drawn:
             cells |= axes.cells(row)
         else:
-            cells["ẽ_c"] = mean_cell(errors_of(row.record).values())
+            cells["ẽ_c"] = mean_cell(episode_errors(row.record).values())
         if best:
-            own, other = errors_of(row.record), errors_of(best.record)
+            own, other = episode_errors(row.record), episode_errors(best.record)
             cells[f"worse than {best.cells['method']} by"] = Cell(NOTHING) if row is best else (
                 mean_cell(own[seed] - other[seed] for seed in own.keys() & other.keys()))
-        cells |= _numbers(row, others)
+        cells |= _number_cells(row, others)
         if row.cells["skill"] is None and row.cells.get("contrast_error") is not None:
             without = 1.0 - row.cells["contrast_error"]
             cells["skill"] = Cell(f"{number(without)}†", without)
         rows.append(cells)
-    keep = ["ẽ_c"] if board.of_class == "injection" else ["ẽ_c", "skill"]
+    keep = ["ẽ_c"] if board.category == "injection" else ["ẽ_c", "skill"]
     return Table.of(rows, label=board.title, keep=keep)
 
 
-def run_seeds(board: Board) -> list[str]:
+def run_seeds(board: Leaderboard) -> list[str]:
     """Return the seeds of each row, and how many of them failed."""
     return [", ".join([row.cells["seeds"], *(word for word in row.badges if "failed" in word)])
             for row in board.rows]
 
 
-def run_title(board: Board) -> str:
+def run_title(board: Leaderboard) -> str:
     """Return environment, class, and the seeds if they are the same for all rows."""
     seeds = set(run_seeds(board))
-    return ", ".join([board.title, board.of_class, *(seeds if len(seeds) == 1 else ())])
+    return ", ".join([board.title, board.category, *(seeds if len(seeds) == 1 else ())])
 
 
 def explanations(tables: Iterable[Table]) -> dict[str, str]:
     """Return heading -> explanation of the headings of these tables."""
     shown = {heading for each in tables for heading in each.headings}
-    return {heading: text for heading, text in meanings(measured=True).items() if heading in shown}
+    return {heading: text for heading, text in column_descriptions(measured=True).items()
+            if heading in shown}
 
 
 # -- text ------------------------------------------------------------------------------------------
 
 
-def terminal_tables(boards: Sequence[Board], characters: int) -> str:
+def terminal_tables(boards: Sequence[Leaderboard], characters: int) -> str:
     """Return a table of each board, at most ``characters`` wide, and notes."""
     parts = []
     left_out: dict[str, None] = {}
     for board in boards:
         table = run_table(board, title="method")
         table = table._replace(rows=[row._replace(cells=[
-            cell._replace(text=charts.shortened(cell.text, MAX_LABEL_CHARS)) for cell in row.cells])
+            cell._replace(text=charts.truncate(cell.text, MAX_LABEL_CHARS)) for cell in row.cells])
             for row in table.rows])
         worse = [heading for heading in table.headings if heading.startswith("worse than ")]
         order = [*COLUMN_PRIORITY[:2], *worse, *COLUMN_PRIORITY[2:]]
@@ -329,7 +336,7 @@ def terminal_tables(boards: Sequence[Board], characters: int) -> str:
     return "\n\n".join(parts)
 
 
-def markdown(boards: Sequence[Board]) -> str:
+def markdown(boards: Sequence[Leaderboard]) -> str:
     """Return the tables of all boards as Markdown."""
     return "\n\n".join(f"## {as_markdown(run_title(board))}\n\n{run_table(board).markdown()}"
                        for board in boards) + "\n"
@@ -337,25 +344,25 @@ def markdown(boards: Sequence[Board]) -> str:
 
 # -- charts ----------------------------------------------------------------------------------------
 
-MAX_CURVES, N_STRONG = 7, 5
+MAX_CURVES, N_HIGHLIGHTED = 7, 5
 """Curves that can be told apart, and the number drawn strongly where there are more."""
 
 
-def cost_chart(board: Board) -> charts.Chart | None:
+def cost_chart(board: Leaderboard) -> charts.Chart | None:
     """Draw error against computing time per step; the note names the methods on the front. None
     without data."""
-    points = [charts.Point(row.cells["title"], row.colour, row.cells["seconds_per_step"],
-                           row.cells["error"], row.competes)
-              for row, _ in lines(board)
+    points = [charts.ParetoPoint(row.cells["title"], row.colour, row.cells["seconds_per_step"],
+                           row.cells["error"], row.is_ranked)
+              for row, _ in group_by_agent(board)
               if row.cells["error"] is not None and row.cells["seconds_per_step"]]
     if not points:
         return None
-    best = ", ".join(point.name for point in charts.optimal(points))
-    svg = charts.front(points, "time per step on one core, ms", "relative error ẽ_c")
+    best = ", ".join(point.name for point in charts.pareto_front(points))
+    svg = charts.pareto_chart(points, "time per step on one core, ms", "relative error ẽ_c")
     return charts.Chart(svg, charts.legend(points), f": {best}" if best else "")
 
 
-def curve_chart(board: Board) -> charts.Chart | None:
+def curve_chart(board: Leaderboard) -> charts.Chart | None:
     """Draw the error of each scored step, the mean over the episodes. None without data."""
     found = []
     for row in board.rows:
@@ -365,23 +372,23 @@ def curve_chart(board: Board) -> charts.Chart | None:
             found.append((row, np.mean(errors, axis=0)))
     if not found:
         return None
-    strong = _strong([row for row, _ in found])
+    strong = _highlighted_rows([row for row, _ in found])
     series = [charts.Series(row.cells["title"], row.colour, errors, faint=row not in strong)
               for row, errors in found]
     steps = np.arange(1, max(len(each.values) for each in series) + 1)
-    svg = charts.lines(steps, series, "scored state", "relative error")
+    svg = charts.line_chart(steps, series, "scored state", "relative error")
     return charts.Chart(svg, charts.legend(each for each in series if not each.faint),
                         " Thin: all other methods." if len(strong) < len(found) else "")
 
 
-def _strong(rows: list[Row]) -> list[Row]:
+def _highlighted_rows(rows: list[MethodRow]) -> list[MethodRow]:
     """Return the rows with strong curves: all, or of many two floors or references and the best
     others, trainings of one agent once."""
     if len(rows) <= MAX_CURVES:
         return rows
     chosen = [row for row in rows if row.unranked][:2]
-    kinds: dict[str, Row] = {}
+    kinds: dict[str, MethodRow] = {}
     for row in rows:
         if not row.unranked:
-            kinds.setdefault(agent(row.cells["method"]), row)
-    return chosen + list(kinds.values())[:N_STRONG - len(chosen)]
+            kinds.setdefault(agent_name(row.cells["method"]), row)
+    return chosen + list(kinds.values())[:N_HIGHLIGHTED - len(chosen)]

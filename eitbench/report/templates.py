@@ -25,7 +25,7 @@ ICON = f"data:image/svg+xml,{quote(_DRAWING, safe='')}"
 """Icon of the browser's tab: a pipe with a slug."""
 
 
-def rendered(name: str, /, **contents: Any) -> bytes:
+def render_template(name: str, /, **contents: Any) -> bytes:
     """Return the page that one of the templates in this folder makes of its contents."""
     return _environment().get_template(name).render(**contents).encode()
 
@@ -34,20 +34,20 @@ def rendered(name: str, /, **contents: Any) -> bytes:
 def _environment() -> jinja2.Environment:
     made = jinja2.Environment(loader=jinja2.PackageLoader("eitbench.report", "."), autoescape=True,
                               trim_blocks=True, lstrip_blocks=True, keep_trailing_newline=True,
-                              undefined=jinja2.StrictUndefined, finalize=_visible)
-    made.globals |= {"breakable": breakable, "icon": ICON}
+                              undefined=jinja2.StrictUndefined, finalize=_finalize)
+    made.globals |= {"add_line_breaks": add_line_breaks, "icon": ICON}
     return made
 
 
-def _visible(value: Any) -> Any:
+def _finalize(value: Any) -> Any:
     """Return text with control characters spelt out, and markup as it is."""
     return cleaned(value, lines=True) if type(value) is str else value
 
 
-def breakable(text: str) -> Markup:
+def add_line_breaks(text: str) -> Markup:
     """Return HTML of a name that may break after underscores and slashes and before @, ẽ_c
     excepted."""
-    html = str(escape(_visible(text)))
+    html = str(escape(_finalize(text)))
     html = html.replace("_", "_<wbr/>").replace("ẽ_<wbr/>", "ẽ_").replace("@", "<wbr/>@")
     return Markup(re.sub(r"/(?=\w{3})", "/<wbr/>", html))
 

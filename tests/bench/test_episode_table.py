@@ -10,7 +10,7 @@ from eitbench.bench import load
 from eitbench.bench.episode_table import NAME, episode_table, read_episode_table, write_episode_table
 from eitbench.bench.records import newest, read_records, write_record
 from eitbench.report import compare
-from eitbench.report.boards import anchors, shipped_anchors
+from eitbench.report.boards import anchors, bundled_anchors
 
 from tiny import several_boards
 
@@ -57,14 +57,14 @@ def test_compare_and_skill_need_no_records(tmp_path, monkeypatch):
     (tmp_path / NAME).write_bytes((RESULTS.parent / NAME).read_bytes())
 
     def compared():
-        pair = [compare.find(name, tmp_path / "mine") for name in ("kalman_filter", "extended_kalman_filter")]
-        return compare.compare(*pair, "error", compare.floors(tmp_path / "mine"))
+        pair = [compare.find_records(name, tmp_path / "mine") for name in ("kalman_filter", "extended_kalman_filter")]
+        return compare.compare(*pair, "error", compare.naive_baseline_records(tmp_path / "mine"))
 
     here = compared()
     monkeypatch.setattr(compare, "SHIPPED", folder)
     pd.testing.assert_frame_equal(compared(), here)
     records = read_records(RESULTS)
-    assert shipped_anchors(records) == anchors(records)
+    assert bundled_anchors(records) == anchors(records)
 
 
 @pytest.mark.parametrize("damage", [

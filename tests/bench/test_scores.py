@@ -11,7 +11,7 @@ from eitbench.bench import scores
 from eitbench.bench.records import read_records
 from eitbench.bench.scores import Outcome, Score, register_score, scored
 from eitbench.report import compare
-from eitbench.report.boards import run_boards
+from eitbench.report.boards import run_leaderboards
 from eitbench.report.site import collect, render, render_site
 from eitbench.report.tables import run_table
 from eitbench.worlds import entry
@@ -77,7 +77,7 @@ def test_a_new_score_is_shown_everywhere(apart):
             episode["scores"]["worst_step"] = max(episode["step_errors"])
     expected = {record["method"]: 100.0 * np.mean([max(episode["step_errors"])
                                                    for episode in record["episodes"]]) for record in records}
-    assert "worst" in run_table(run_boards(records)[0]).headings
+    assert "worst" in run_table(run_leaderboards(records)[0]).headings
     made = render(collect(records))
     rows = {row["method"]: row for row in csv.DictReader(io.StringIO(made["leaderboard.csv"]))}
     for method, value in expected.items():
@@ -89,7 +89,7 @@ def test_a_new_score_is_shown_everywhere(apart):
             for name in ("kalman_filter", "homogeneous"))
     table = compare.compare(a, b, "worst_step")
     assert table["a"][0] == pytest.approx(expected["kalman_filter"]) and table["better"][0] == 1.0
-    assert said(compare.shown(table, "kalman", "floor", "worst_step"))["verdict"][0] == "kalman"
+    assert said(compare.comparison_table(table, "kalman", "floor", "worst_step"))["verdict"][0] == "kalman"
 
 
 def test_where_more_is_better_the_other_wins(apart):
@@ -102,7 +102,7 @@ def test_where_more_is_better_the_other_wins(apart):
             episode["scores"]["worst_step"] = max(episode["step_errors"])
     table = compare.compare([records["kalman_filter"]], [records["homogeneous"]], "worst_step")
     assert table["better"][0] == 0.0
-    assert said(compare.shown(table, "kalman", "floor", "worst_step"))["verdict"][0] == "floor"
+    assert said(compare.comparison_table(table, "kalman", "floor", "worst_step"))["verdict"][0] == "floor"
 
 
 @pytest.mark.parametrize("name", ["nis", "voltage_discrepancy", "beauty"])

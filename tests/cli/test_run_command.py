@@ -5,7 +5,7 @@ import re
 import pytest
 from eitbench.bench.variants import flat, variants
 from eitbench.cli.app import app
-from eitbench.report.sweep import swept
+from eitbench.report.sweep import swept_parameter
 from typer.testing import CliRunner
 
 from short import shorten
@@ -112,7 +112,7 @@ def test_variants(settings, worlds):
     """Words become what `world=` takes; one number that differs is swept, two are not."""
     assert variants(settings) == worlds
     differ = {key for key in flat(worlds[0]) if len({str(flat(world)[key]) for world in worlds}) > 1}
-    assert swept(worlds) == (differ.pop() if len(differ) == 1 else None)
+    assert swept_parameter(worlds) == (differ.pop() if len(differ) == 1 else None)
 
 
 @pytest.mark.parametrize(("settings", "message"), [

@@ -13,7 +13,7 @@ from eitbench.bench.records import read_record, read_records, sealed, write_reco
 from eitbench.envs.measured import case_env
 from eitbench.measured.cases import CASES, case_id, file_sha256, read_case
 from eitbench.measured.segmentation import ktc_score
-from eitbench.report.site.measured import Measured
+from eitbench.report.site.measured import MeasuredBoards
 from scipy.io import savemat
 from tanks import VESSEL, moving, stationary
 
@@ -179,9 +179,9 @@ def test_the_leaderboard_shows_records(results):
     scores = [each["scores"]["prediction_error"] for each in read_record(path)["episodes"]]
     assert f"{np.mean(scores):.3g}" in text[text.index("## measured"):]
     path.write_text(path.read_text("utf-8").replace('"official": false', '"official": true'), "utf-8")
-    measured = Measured.of(folder)
+    measured = MeasuredBoards.of(folder)
     assert [each["method"] for each in measured.records["moving"]] == ["mine"]
-    assert len(measured.complaints) == 1
+    assert len(measured.errors) == 1
 
 
 def test_a_case_with_a_truth_has_the_ktc_score(folder):
@@ -209,7 +209,7 @@ def test_tables_equal_a_computation_by_hand():
                 "episodes": episodes}
 
     cases = {name: read_case(name) for name in ("iirc", "montreal")}
-    measured = Measured(cases, {
+    measured = MeasuredBoards(cases, {
         "iirc": [record_of("good", [1.0, 2.0, 3.0]), record_of("naive", [8.0], "floor")],
         "montreal": [record_of("good", [1.0]), record_of("late", [3.0]), record_of("naive", [4.0], "floor")]}, [])
     assert [[cell.plain for cell in row.cells] for row in measured.case_table("iirc").rows] == [

@@ -13,7 +13,7 @@ from eitbench.bench import load
 from eitbench.bench.records import read_records, write_record
 from eitbench.bench.statistics import interquartile_mean, stratified_bootstrap
 from eitbench.bench.tracks import named
-from eitbench.report.boards import ALL, boards, class_of
+from eitbench.report.boards import ALL, boards, record_category
 from eitbench.report.site import collect, render
 
 from tiny import BOARD_IDS, RUN, record, sha
@@ -162,8 +162,8 @@ def test_an_aggregate_is_ranked_by_what_orders_it():
 
 def test_targets_at_rest_are_a_class_of_their_own():
     """They are not averaged with those that flow."""
-    assert class_of(record("a", [0.1], id="eitbench/StationaryTank2D-v0")) == "stationary"
-    assert [class_of(record("a", [0.1], board=board)) for board in BOARD_IDS] == list(BOARD_IDS)
+    assert record_category(record("a", [0.1], id="eitbench/StationaryTank2D-v0")) == "stationary"
+    assert [record_category(record("a", [0.1], board=board)) for board in BOARD_IDS] == list(BOARD_IDS)
 
 
 def test_injection_counts_from_the_random_pair():

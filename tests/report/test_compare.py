@@ -14,7 +14,14 @@ from eitbench.bench.statistics import (
 from eitbench.bench.text import scores_by_seed
 from eitbench.report import compare as comparison
 from eitbench.report.boards import boards
-from eitbench.report.compare import compare, find, floors, in_terminal, names, shown
+from eitbench.report.compare import (
+    compare,
+    comparison_table,
+    display_names,
+    find_records,
+    format_comparison,
+    naive_baseline_records,
+)
 
 from tables import said
 from tiny import record, sha
@@ -78,7 +85,7 @@ def test_over_environments_gains_are_compared():
     on_boards = boards([*floor, *a, *b])
     gains = on_boards[on_boards["environment"] == "all"].set_index("method")["gain"]
     assert (table["a"][2], table["b"][2]) == pytest.approx((gains["a"], gains["b"]), rel=1e-12)
-    text = said(shown(table, "a", "b"))
+    text = said(comparison_table(table, "a", "b"))
     assert list(text["verdict"]) == ["a", "b", "a"] and text["ẽ_c of a"][2].startswith("gain 0.")
     assert list(compare(a, b)["environment"]) == [PIPE_NAME, TANK_NAME]
     others = compare(a, b, "seconds_per_step", floor)
@@ -111,38 +118,40 @@ def test_records_are_found_by_name_version_and_file(tmp_path, monkeypatch):
     monkeypatch.setattr(comparison, "SHIPPED", tmp_path)
     a, (b, _) = two_methods()
     paths = [write_record(tmp_path, each) for each in [*a, b]]
-    assert find("a", tmp_path) == a and find(f"a@{sha('a1')[:4]}", tmp_path) == a
-    assert find(str(paths[2]), tmp_path / "nowhere") == [b]
+    assert find_records("a", tmp_path) == a and find_records(f"a@{sha('a1')[:4]}", tmp_path) == a
+    assert find_records(str(paths[2]), tmp_path / "nowhere") == [b]
     write_record(tmp_path, newer := record("a", [0.1], version="2"))
     with pytest.raises(ValueError, match=rf"a fits several versions: a@{sha('a2')[:8]}, a@{sha('a1')[:8]}"):
-        find("a", tmp_path)
-    assert find(f"a@{sha('a2')[:8]}", tmp_path) == [newer]
-    assert names(newer, a[0]) == (f"a@{sha('a2')[:8]}", f"a@{sha('a1')[:8]}") and names(newer, b) == ("a", "b")
+        find_records("a", tmp_path)
+    assert find_records(f"a@{sha('a2')[:8]}", tmp_path) == [newer]
+    assert display_names(newer, a[0]) == (f"a@{sha('a2')[:8]}", f"a@{sha('a1')[:8]}")
+    assert display_names(newer, b) == ("a", "b")
     ours = [record("c", [0.1], version=version) for version in ("v1", "v2")]
     for each in ours:
         write_record(tmp_path, each)
-    assert find("c", tmp_path) == ours[1:] and find("c@v1", tmp_path) == ours[:1]
+    assert find_records("c", tmp_path) == ours[1:] and find_records("c@v1", tmp_path) == ours[:1]
     write_record(tmp_path, tenth := record("c", [0.1], version="v10"))
-    assert find("c@v1", tmp_path) == ours[:1] and find("c", tmp_path) == [tenth]
+    assert find_records("c@v1", tmp_path) == ours[:1] and find_records("c", tmp_path) == [tenth]
     for nobody in ("d", "c@v", f"a@{sha('a1')[:3]}"):                # of digits four are enough, fewer are not
         with pytest.raises(ValueError, match=f"there is no record of {nobody} in"):
-            find(nobody, tmp_path)
+            find_records(nobody, tmp_path)
 
 
 def test_words_follow_from_the_intervals():
     """The verdict names who is better, if anybody; the Markdown is a table of the same text."""
     a, b = two_methods()
     table = compare(a, b)
-    text = said(shown(table, "mine", "yours"))
-    assert text["verdict"][1] == "mine" and said(shown(compare(b, a), "yours", "mine"))["verdict"][1] == "mine"
+    text = said(comparison_table(table, "mine", "yours"))
+    assert text["verdict"][1] == "mine"
+    assert said(comparison_table(compare(b, a), "yours", "mine"))["verdict"][1] == "mine"
     low, high = table["low"][0], table["high"][0]
     assert text["verdict"][0] == ("mine" if high < 0 else "yours" if low > 0 else "–")
     assert re.fullmatch(r"-0\.\d+ \(-0\.\d+ to -0\.\d+\)", text["difference"][1])
     assert re.fullmatch(r"\d+ % \(\d+ to \d+ %\)", text["mine better"][0])
-    lines = shown(table, "mine", "yours").markdown().splitlines()
+    lines = comparison_table(table, "mine", "yours").markdown().splitlines()
     assert len(lines) == 4 and len({len(line) for line in lines}) == 1 and all(
         cell in lines[3] for cell in text.iloc[1])
-    few = said(shown(compare([record("a", [0.1])], [record("b", [0.4])]), "a", "b"))
+    few = said(comparison_table(compare([record("a", [0.1])], [record("b", [0.4])]), "a", "b"))
     assert (few["verdict"][0], few["a better"][0], few["difference"][0]) == ("–", "100 %", "-0.3")
 
 
@@ -153,15 +162,15 @@ def test_who_is_not_in_the_folder_comes_with_the_package(tmp_path, monkeypatch):
     ours, floor = record("kalman_filter", [0.1], version="v1"), record("homogeneous", [0.2], role="floor")
     for folder, each in ((own, mine := record("mine", [0.1])), (shipped, ours), (shipped, floor)):
         write_record(folder, each)
-    assert find("mine", own) == [mine] and find("kalman_filter", own) == [ours]
-    assert floors(own) == floors(tmp_path / "nowhere") == [floor]
+    assert find_records("mine", own) == [mine] and find_records("kalman_filter", own) == [ours]
+    assert naive_baseline_records(own) == naive_baseline_records(tmp_path / "nowhere") == [floor]
 
 
 def test_in_a_terminal_lines_are_not_wrapped():
     """Names stand above, and what has no room is named below."""
     a, b = two_methods()
     table = compare(a, b)
-    whole, narrow = (in_terminal(table, "a_long_name", "another", "error", letters) for letters in (200, 60))
+    whole, narrow = (format_comparison(table, "a_long_name", "another", "error", letters) for letters in (200, 60))
     assert whole.startswith("A: a_long_name\nB: another\n\n| environment") and "no room" not in whole
     assert narrow.endswith("no room for episodes, ẽ_c of A, ẽ_c of B, A better")
     rows = narrow.split("\n\n")[1].splitlines()

@@ -9,7 +9,7 @@ from eitbench.bench.records import read_records, sealed, write_record
 from eitbench.bench.store import EpisodeStore
 from eitbench.bench.tracks import named
 from eitbench.cli.app import app
-from eitbench.report.boards import run_boards
+from eitbench.report.boards import run_leaderboards
 from eitbench.report.page import write_page
 from eitbench.report.site import collect, render, render_site
 from pages import Page
@@ -43,7 +43,7 @@ def test_text_stays_text(text, tmp_path):
     records = hostile(text)
     site = collect(records)
     pages = {path: content.decode() for path, content in render_site(site).items() if path.endswith(".html")}
-    pages["results"] = write_page(EpisodeStore(tmp_path), run_boards(records)).read_text(encoding="utf-8")
+    pages["results"] = write_page(EpisodeStore(tmp_path), run_leaderboards(records)).read_text(encoding="utf-8")
     for path, page in pages.items():
         parsed = Page(page)
         assert not re.search(UNSEEN, page), path

@@ -15,7 +15,7 @@ from eitbench.bench.tracks import Environment
 from eitbench.data.cache import CACHE_VARIABLE
 from eitbench.numerics.round_meshes import extrude, uniform_disc
 from eitbench.report import charts, page
-from eitbench.report.boards import run_boards
+from eitbench.report.boards import run_leaderboards
 from eitbench.report.sweep import sweeps
 from eitbench.worlds.catalogue import PIPE_3D
 from pages import Page, svgs
@@ -46,7 +46,7 @@ def made(tmp_path_factory):
         run_jobs([Job(*pair, seed) for pair in pairs for seed in (1, 2)], store,
                  command="eitbench run --baseline <script>")
         records = store.write_records()
-        path = page.write_page(store, run_boards(records))
+        path = page.write_page(store, run_leaderboards(records))
     return folder, records, path.read_text(encoding="utf-8")
 
 
@@ -98,9 +98,9 @@ def test_a_page_of_failures_or_without_estimates(made, tmp_path):
     """Where only the records were kept, all but the pictures is drawn."""
     _, records, _ = made
     failed = [each for each in records if each["method"] == "surely_failing"]
-    html = page.write_page(EpisodeStore(tmp_path), run_boards(failed)).read_text(encoding="utf-8")
+    html = page.write_page(EpisodeStore(tmp_path), run_leaderboards(failed)).read_text(encoding="utf-8")
     assert "2 failed" in html and svgs(html) == [] and "RuntimeError: <b>&lt;" in " ".join(Page(html).text)
-    html = page.write_page(EpisodeStore(tmp_path), run_boards(records)).read_text(encoding="utf-8")
+    html = page.write_page(EpisodeStore(tmp_path), run_leaderboards(records)).read_text(encoding="utf-8")
     assert len(svgs(html)) == 3 and "Snapshots" not in html
 
 
@@ -110,7 +110,7 @@ def test_a_sweep_is_on_the_page(tmp_path):
         "world": {"instrument": {"noise_relative": value}}}})
         for i, (value, error) in enumerate([(0.3, 0.2), (0.01, 0.1)])]
     found = sweeps(records, "instrument.noise_relative")
-    html = page.write_page(EpisodeStore(tmp_path), run_boards(records), found).read_text(encoding="utf-8")
+    html = page.write_page(EpisodeStore(tmp_path), run_leaderboards(records), found).read_text(encoding="utf-8")
     section = html.split("<h2>instrument.noise_relative</h2>")[1].split("</section>")[0]
     cells = re.findall(r">([^<>]+)</t[hd]>", section.replace("<wbr/>", ""))
     assert cells == ["method", "0.01", "0.3", "a", "0.1", "0.2"] and len(svgs(section)) == 1
@@ -137,9 +137,9 @@ def test_a_round_pipe_is_cut_along_its_axis():
 def test_odd_values_can_be_drawn(values):
     """One step, no change and a perfect estimate are within the picture, in curves and marks."""
     series = [charts.Series("mine", 0, np.array(values))]
-    points = [charts.Point("p", 0, value, value) for value in values]
-    for drawn in (charts.lines(np.arange(1, 1 + len(values)), series, "step", "error"),
-                  charts.front(points, "ms", "error")):
+    points = [charts.ParetoPoint("p", 0, value, value) for value in values]
+    for drawn in (charts.line_chart(np.arange(1, 1 + len(values)), series, "step", "error"),
+                  charts.pareto_chart(points, "ms", "error")):
         chart = ElementTree.fromstring(drawn)
         width, height = (float(x) for x in chart.get("viewBox").split()[2:])
         marks = [(float(mark.get("cx")), float(mark.get("cy"))) for mark in chart.iter("circle")]
@@ -150,11 +150,11 @@ def test_odd_values_can_be_drawn(values):
 
 def test_the_front_has_the_methods_that_no_other_beats():
     """Fast and poor, slow and good; neither the dominated nor the floor, however fast."""
-    points = [charts.Point(name, i, x, y, competes) for i, (name, x, y, competes) in enumerate([
+    points = [charts.ParetoPoint(name, i, x, y, competes) for i, (name, x, y, competes) in enumerate([
         ("good", 9.0, 1.0, True), ("fast", 1.0, 5.0, True), ("beaten", 9.0, 5.0, True), ("between", 3.0, 2.0, True),
         ("same time, worse", 1.0, 6.0, True), ("floor", 0.1, 0.5, False)])]
-    assert [point.name for point in charts.optimal(points)] == ["fast", "between", "good"]
-    chart = ElementTree.fromstring(charts.front(points, "ms", "error"))
+    assert [point.name for point in charts.pareto_front(points)] == ["fast", "between", "good"]
+    chart = ElementTree.fromstring(charts.pareto_chart(points, "ms", "error"))
     assert len(chart.findall("circle")) == 6
     assert len(chart.find("polyline[@class='front']").get("points").split()) == 3
 

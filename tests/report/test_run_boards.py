@@ -6,7 +6,7 @@ import re
 import numpy as np
 import pytest
 from eitbench.bench.text import mean_and_interval, number, rounded, seed_ranges, with_interval
-from eitbench.report.boards import run_boards, title_of, world
+from eitbench.report.boards import environment_title, run_leaderboards, world_key
 from eitbench.report.tables import markdown, run_table, terminal_tables
 from hypothesis import given
 from hypothesis import strategies as st
@@ -30,7 +30,7 @@ ANCHORS = [made("homogeneous", "smoothing", FLOOR), made("true_model_smoother", 
 
 def row(records, method, board):
     """The cells of one method on one board."""
-    return next(row.cells for each in run_boards(records) if each.of_class == board
+    return next(row.cells for each in run_leaderboards(records) if each.category == board
                 for row in each.rows if row.cells["method"] == method)
 
 
@@ -136,7 +136,7 @@ def test_anchors_look_back_on_the_longest_made(official):
 def test_names(id, kwargs, name, title):
     """A world is named without lag and assumptions, which leave the truth unchanged; a title has all arguments."""
     given = {"environment": {"id": id, "name": "x" if kwargs else id.replace("/", "-"), "kwargs": kwargs}}
-    assert (world(given), title_of(given)) == (name, title)
+    assert (world_key(given), environment_title(given)) == (name, title)
 
 
 def test_order_of_boards_and_methods():
@@ -144,7 +144,7 @@ def test_order_of_boards_and_methods():
     records = [made("d", "smoothing", [0.2]), made("e", "filter", {"dev:0": 0.1}), made("c", "filter", [None]),
                made("f", "filter", [0.1], id="eitbench/Pipe3D-v0"), made("b", "filter", [0.3]),
                made("a", "filter", [0.2])]
-    found = run_boards(records)
+    found = run_leaderboards(records)
     assert [[row.cells["method"] for row in board.rows] for board in found] == [
         ["a", "b", "c"], ["d"], ["f"], ["e"]]
     assert all(row.cells["rank"] is None for board in found for row in board.rows)
@@ -163,7 +163,7 @@ def test_all_episodes_of_a_run_are_shown():
 
 def test_failures_are_counted_not_averaged():
     """Scores are of the finished episodes; the table has the number of others."""
-    (board,) = run_boards([made("mine", "filter", [0.1, 0.2, None]), made("bad", "filter", [None])])
+    (board,) = run_leaderboards([made("mine", "filter", [0.1, 0.2, None]), made("bad", "filter", [None])])
     text = said(run_table(board))
     assert list(text["seeds"]) == ["test:0-2, 1 failed", "test:0, 1 failed"] and list(text["ẽ_c"])[1] == "–"
     assert text["ẽ_c"][0] == rounded(*mean_and_interval([0.1, 0.2]))
@@ -172,7 +172,7 @@ def test_failures_are_counted_not_averaged():
 def test_units_and_missing_values():
     """Time in ms, voltage discrepancy in mV²; the skill falls back to 1 − contrast; empty columns are absent."""
     scores = {"seconds_per_step": 0.0025, "voltage_discrepancy": 4e-6, "contrast_error": 0.25}
-    (board,) = run_boards([made("mine", "filter", [0.1], scores=scores), made("other", "filter", [0.2])])
+    (board,) = run_leaderboards([made("mine", "filter", [0.1], scores=scores), made("other", "filter", [0.2])])
     text = said(run_table(board))
     assert (text["ms/step"][0], text["ẽ_V"][0], text["skill"][0]) == ("2.5", "4", "0.75†")
     assert text["ẽ_V"][1] == text["skill"][1] == "–" and "CRPS" not in text
@@ -180,28 +180,28 @@ def test_units_and_missing_values():
 
 def test_the_drawn_table_has_bootstrap_intervals():
     """From six episodes on; the numbers are those of the board."""
-    (board,) = run_boards([made("mine", "filter", [0.1, 0.2, 0.15, 0.12, 0.18, 0.11])])
+    (board,) = run_leaderboards([made("mine", "filter", [0.1, 0.2, 0.15, 0.12, 0.18, 0.11])])
     (cells,) = said(run_table(board, drawn=True)).to_dict("records")
-    assert cells["ẽ_c"] == with_interval(*board.rows[0].three("error")) and "(" in cells["ẽ_c"]
+    assert cells["ẽ_c"] == with_interval(*board.rows[0].interval("error")) and "(" in cells["ẽ_c"]
 
 
 def test_terminal_tables_fit_and_name_what_is_left_out():
     """A title with what all rows share, aligned lines within the width, and the names of missing columns."""
     scores = {"contrast_error": 0.2, "nis": 1.1, "crps": 1.0, "coverage_50": 0.5, "coverage_90": 0.9}
-    found = run_boards([made("mine", "filter", [0.1, 0.2], scores=scores), made("y" * 50, "filter", [0.2, 0.2])])
+    found = run_leaderboards([made("mine", "filter", [0.1, 0.2], scores=scores), made("y" * 50, "filter", [0.2, 0.2])])
     title, table, note, missing = terminal_tables(found, 70).split("\n\n")
     assert title == "Pipe2D-v0, filter, test:0-1" and note.startswith("† ") and missing.startswith("no room for ")
     lines = table.splitlines()
     assert len(lines) == 4 and {len(line) for line in lines} == {len(lines[0])} and len(lines[0]) <= 70
     assert "y" * 29 + "…" in table and lines[1].split("|")[2].endswith(":")
-    uneven = terminal_tables(run_boards([made("a", "filter", [0.1, 0.2]), made("b", "filter", [0.2])]), 200)
+    uneven = terminal_tables(run_leaderboards([made("a", "filter", [0.1, 0.2]), made("b", "filter", [0.2])]), 200)
     assert "| test:0-1" in uneven and uneven.startswith("Pipe2D-v0, filter\n")
 
 
 def test_markdown_is_a_table():
     """Every line has the same number of cells and the same width, whatever a title contains."""
     odd = made("mine", "filter", [0.1, 0.2], title="mine | yours")
-    lines = markdown(run_boards([odd, made("b", "filter", [0.2])])).splitlines()[2:]
+    lines = markdown(run_leaderboards([odd, made("b", "filter", [0.2])])).splitlines()[2:]
     assert len(lines) == 4 and re.fullmatch(r"[|:-]+", lines[1]) and len({len(line) for line in lines}) == 1
     assert len({len(re.findall(r"(?<!\\)\|", line)) for line in lines}) == 1
 

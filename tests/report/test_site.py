@@ -17,8 +17,8 @@ from eitbench.report import charts
 from eitbench.report.site import (
     HEADLINE,
     LINKS,
-    METHODS,
-    ROBUSTNESS,
+    METHODS_FOLDER,
+    ROBUSTNESS_PAGE,
     collect,
     documentation,
     headline,
@@ -27,8 +27,8 @@ from eitbench.report.site import (
     render_site,
     write_site,
 )
-from eitbench.report.site.robustness import families, heading
-from eitbench.report.tables import lines, markdown_table, page_table
+from eitbench.report.site.robustness import shift_families, shift_heading
+from eitbench.report.tables import group_by_agent, markdown_table, page_table
 from eitbench.report.templates import markdown
 from pages import Page, text_of
 
@@ -64,7 +64,7 @@ def test_published_files_are_rendered_from_the_records():
     """`eitbench leaderboard --records leaderboards/results` changes nothing; the site is not too large either."""
     folder = ROOT / "leaderboards"
     found = collect(read_records(folder / "results"), folder)
-    assert not found.measured.complaints
+    assert not found.measured.errors
     texts = {name: text.encode() for name, text in render(found).items()}
     expected = {f"site/{path}": content for path, content in render_site(found).items()} | texts
     published = {path.relative_to(folder).as_posix(): path.read_bytes()
@@ -118,7 +118,7 @@ def test_numbers_are_those_of_the_boards(pages):
                 assert ("self-reported" in cells[1]) != row.cells["official"]
                 for name in ("error", "gain"):
                     if row.cells[name] is not None:
-                        assert with_interval(*row.three(name)) in " ".join(cells)
+                        assert with_interval(*row.interval(name)) in " ".join(cells)
                 assert board.is_aggregate or number(row.cells["seconds_per_step"]) in cells
     ranks = [cells[0] for cells in rows_of(pages["environments/eitbench-Pipe2D-v0.html"], "<h2>Leaderboard</h2>")]
     assert [rank for rank in ranks if rank.startswith("1")] == ["1 shared", "1 shared"]
@@ -193,7 +193,7 @@ def board_of(records):
 def test_the_line_of_an_agent_is_the_mean_of_its_trainings():
     """Error, gain, interval over episodes, and the range of their ranks; Markdown has each training."""
     board = board_of(agents(record("ppo_seed3", [*of(0.5)[:5], None])))
-    placed = lines(board)
+    placed = group_by_agent(board)
     assert [line.row.cells["method"] for line in placed] == ["ppo", "between", "seer", "behind", "homogeneous"]
     row, parts = placed[0]
     assert [part.cells["method"] for part in parts] == ["ppo_seed2", "ppo_seed0", "ppo_seed1", "ppo_seed3"]
@@ -219,7 +219,7 @@ def test_the_line_of_an_agent_is_the_mean_of_its_trainings():
 def test_grouped_trainings(records, expected):
     """Trainings of one agent, run by the same side, of which two have a rank."""
     board = board_of([record("homogeneous", list(LEVEL), **FLOOR), *records])
-    assert sorted(line.row.cells["method"] for line in lines(board)) == sorted([*expected, "homogeneous"])
+    assert sorted(line.row.cells["method"] for line in group_by_agent(board)) == sorted([*expected, "homogeneous"])
 
 
 def test_an_outperformed_reference_is_marked():
@@ -246,7 +246,7 @@ def shifted(*more):
 
 
 def robustness(records):
-    (family,) = families(collect(records).boards)
+    (family,) = shift_families(collect(records).boards)
     shown = said(family.table)
     return shown.set_index(shown["method"].str.extract(r"(\w+)@")[0].rename("name")).drop(columns="method")
 
@@ -263,17 +263,17 @@ def test_robustness_by_hand():
     better = robustness([*shifted()[:-1], record("persistence", [0.11] * 4, id=NOISE, version="v1", **FLOOR),
                          record("mine", [1e-9] * 4, id=NOISE, role="floor")])     # a self-reported floor marks nothing
     assert set(better[better["double noise"].str.contains("below")].index) == {"tuned", "steady"}
-    assert heading("me/WeakWorn-v0", "me/Weak-v0") == "worn" and heading(SHORT, HOME) == "short slugs"
+    assert shift_heading("me/WeakWorn-v0", "me/Weak-v0") == "worn" and shift_heading(SHORT, HOME) == "short slugs"
 
 
 def test_robustness_is_on_the_site_and_in_the_text(pages):
     files, text = rendered(shifted()), render(collect(shifted()))["leaderboard.md"]
-    assert f'href="{ROBUSTNESS}"' in files["index.html"] and ROBUSTNESS not in pages
+    assert f'href="{ROBUSTNESS_PAGE}"' in files["index.html"] and ROBUSTNESS_PAGE not in pages
     for id in (SHORT, NOISE):
         name = id.replace("/", "-")
-        assert f'href="environments/{name}.html"' in files[ROBUSTNESS]
-        assert f'href="../{ROBUSTNESS}"' in files[f"environments/{name}.html"]
-    assert "Slugs pass in half the time" in files[ROBUSTNESS]
+        assert f'href="environments/{name}.html"' in files[ROBUSTNESS_PAGE]
+        assert f'href="../{ROBUSTNESS_PAGE}"' in files[f"environments/{name}.html"]
+    assert "Slugs pass in half the time" in files[ROBUSTNESS_PAGE]
     assert "0.3 × 15 (below the floor)" in text[text.index("## robustness"):]
 
 
@@ -335,7 +335,7 @@ def test_every_link_resolves(site, pages):
 def test_links_beside_the_site(tmp_path):
     """Only to what exists."""
     folder = tmp_path / "leaderboards"
-    for name in (LINKS["How to submit"], LINKS["Code"], f"{METHODS}/kalman_filter.py", *(
+    for name in (LINKS["How to submit"], LINKS["Code"], f"{METHODS_FOLDER}/kalman_filter.py", *(
             f"media/{name}" for name in HEADLINE)):
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
         (folder / name).write_text("")
@@ -367,7 +367,7 @@ def test_contrast(scheme):
     """Text 4.5 to 1 and lines of charts 3 to 1 (WCAG AA), on paper and on cards."""
     colours = {name: pair[scheme] for name, *pair in re.findall(
         r"--(\w+): light-dark\((#\w{6}), (#\w{6})\)", (PACKAGE / "report" / "style.css").read_text())}
-    assert colours.keys() >= {"paper", "card", "ink", "soft", "accent", *(f"c{k}" for k in range(charts.COLOURS))}
+    assert colours.keys() >= {"paper", "card", "ink", "soft", "accent", *(f"c{k}" for k in range(charts.N_COLOURS))}
     for ground in ("paper", "card"):
         for name, colour in colours.items():
             least = 4.5 if name in ("ink", "soft", "accent", "c8") else 3.0 if re.fullmatch(r"c\d+", name) else 0.0

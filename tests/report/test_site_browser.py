@@ -13,7 +13,7 @@ import subprocess
 import pytest
 from eitbench.bench.records import sealed
 from eitbench.bench.store import EpisodeStore
-from eitbench.report.boards import run_boards
+from eitbench.report.boards import run_leaderboards
 from eitbench.report.page import write_page
 from eitbench.report.site import HEADLINE, collect, render_site, write_site
 from PIL import Image
@@ -223,7 +223,7 @@ def test_the_picture_can_be_stopped(flags, first, tmp_path):
 @pytest.mark.parametrize("width", [390, 1280])
 def test_the_results_page_fits(tmp_path, width):
     """Sortable and without overflow, as the site."""
-    path = write_page(EpisodeStore(tmp_path), run_boards(widest()))
+    path = write_page(EpisodeStore(tmp_path), run_leaderboards(widest()))
     assert answer(path, """
         one("thead th:nth-child(2) button").click();
         return [frame.contentDocument.documentElement.scrollWidth, one("tbody td").textContent];""",

@@ -28,18 +28,19 @@ from eitbench.envs.env_docs import describe_environment
 from eitbench.report import tables
 from eitbench.report.boards import (
     ALL,
-    Board,
-    board_table,
-    counted,
+    Leaderboard,
+    MethodRow,
+    aggregate_environments,
+    column_descriptions,
+    environment_title,
     headings,
+    leaderboard_table,
     leaderboards,
-    meanings,
-    title_of,
 )
 from eitbench.report.site import measured, robustness
-from eitbench.report.templates import markdown, markdown_list, rendered
+from eitbench.report.templates import markdown, markdown_list, render_template
 
-ABOUT = {
+CATEGORY_TEXTS = {
     "filter": "Estimates of each moment from the measurements until then.",
     "fixed-lag": "Estimates of each moment from the measurements until a few later.",
     "smoothing": "Estimates of each moment from the whole record.",
@@ -47,54 +48,54 @@ ABOUT = {
     "injection": "The next current is chosen; a Kalman filter inside makes the estimate.",
 }
 """Class -> task."""
-PIPE, AGENTS = "eitbench-Pipe2D-v0", "eitbench-Pipe2DInjectionBudget-v0"
-COMPARED = ("homogeneous", "gauss_newton", "extended_kalman_filter")
+HEADLINE_ENVIRONMENT, AGENT_ENVIRONMENT = "eitbench-Pipe2D-v0", "eitbench-Pipe2DInjectionBudget-v0"
+HEADLINE_METHODS = ("homogeneous", "gauss_newton", "extended_kalman_filter")
 MULTIPLES = ("two", "three", "four", "five", "six", "seven", "eight", "nine", "ten", "eleven",
              "twelve")
-ROBUSTNESS, MEASURED = "robustness.html", "measured.html"
+ROBUSTNESS_PAGE, MEASURED_PAGE = "robustness.html", "measured.html"
 HEADLINE = "headline.webp", "headline.png"
 """Animation of the first page, and its still picture. Others are named like an environment, as in
 eitbench-Pipe2D-v0.webp."""
 LINKS = {"How to submit": "README.md", "Statistics": "../docs/statistics.md",
          "Code": "../README.md"}
 """Link of every page -> file, from the leaderboards' folder."""
-METHODS = "../baselines"
+METHODS_FOLDER = "../baselines"
 """Folder of the built-in methods, from the leaderboards' folder."""
 PUBLIC_EPISODES = "The test episodes are public: anybody can simulate them."
-MARK = b"<strong>eitbench</strong> leaderboards"
+SITE_MARKER = b"<strong>eitbench</strong> leaderboards"
 """Text by which the index.html of a site is recognised."""
 
 
 class Site(NamedTuple):
     """Contents of all pages."""
 
-    boards: list[Board]
+    boards: list[Leaderboard]
     """Class by class, each followed by its aggregate."""
     records: list[dict[str, Any]]
     """Sorted; superseded ones included."""
-    measured: measured.Measured = measured.NOBODY
+    measured: measured.MeasuredBoards = measured.EMPTY
     media: Mapping[str, int] = {}
     """Name of each picture in the folder ``media`` beside the site -> bytes."""
-    beside: frozenset[str] = frozenset()
-    """Those of `LINKS` and `METHODS` that exist."""
+    assets: frozenset[str] = frozenset()
+    """Those of `LINKS` and `METHODS_FOLDER` that exist."""
 
     @property
-    def classes(self) -> dict[str, list[Board]]:
+    def classes(self) -> dict[str, list[Leaderboard]]:
         """Class -> its boards, the aggregate first."""
-        found: dict[str, list[Board]] = {board.of_class: [] for board in self.boards}
+        found: dict[str, list[Leaderboard]] = {board.category: [] for board in self.boards}
         for board in sorted(self.boards, key=lambda board: not board.is_aggregate):
-            found[board.of_class].append(board)
+            found[board.category].append(board)
         return found
 
-    def board(self, of_class: str, environment: str) -> Board | None:
+    def board(self, category: str, environment: str) -> Leaderboard | None:
         """Return one of the boards, if there is one."""
         return next((board for board in self.boards
-                     if (board.of_class, board.environment) == (of_class, environment)), None)
+                     if (board.category, board.environment) == (category, environment)), None)
 
     def page(self, kind: str, root: str = "", /, **contents: Any) -> bytes:
         """Render a template of the site for a page from which ``root`` leads to the site."""
-        links = {words: f"{root}../{name}" for words, name in LINKS.items() if name in self.beside}
-        return rendered(f"site/{kind}.html.j2", root=root, links=links, **contents)
+        links = {words: f"{root}../{name}" for words, name in LINKS.items() if name in self.assets}
+        return render_template(f"site/{kind}.html.j2", root=root, links=links, **contents)
 
     def picture(self, name: str, root: str) -> str:
         """Return the address of a picture; empty if there is none."""
@@ -111,13 +112,14 @@ def collect(records: Iterable[dict[str, Any]], folder: Path | None = None) -> Si
         return site
     media = {path.name: path.stat().st_size for path in sorted((folder / "media").glob("*.*"))
              if path.suffix in (".webp", ".png")}
-    beside = frozenset(name for name in (*LINKS.values(), METHODS) if (folder / name).exists())
-    return site._replace(measured=measured.Measured.of(folder), media=media, beside=beside)
+    assets = frozenset(name for name in (*LINKS.values(), METHODS_FOLDER)
+                       if (folder / name).exists())
+    return site._replace(measured=measured.MeasuredBoards.of(folder), media=media, assets=assets)
 
 
 def render_site(site: Site) -> dict[str, bytes]:
     """Return all files of the site, by their path within it."""
-    families = robustness.families(site.boards)
+    families = robustness.shift_families(site.boards)
     files = {"index.html": index_page(site)}
     for board in site.boards:
         if not board.is_aggregate:
@@ -125,11 +127,11 @@ def render_site(site: Site) -> dict[str, bytes]:
     for name in dict.fromkeys(record["method"] for record in site.records):
         files[f"methods/{name}.html"] = method_page(site, name)
     if families:
-        files[ROBUSTNESS] = site.page("robustness", families=families,
-                                      explanations=robustness.MEANINGS)
+        files[ROBUSTNESS_PAGE] = site.page("robustness", families=families,
+                                      explanations=robustness.ROBUSTNESS_COLUMNS)
     if site.measured.records:
-        files[MEASURED] = site.page("measured", measured=site.measured,
-                                    explanations=measured.MEANINGS)
+        files[MEASURED_PAGE] = site.page("measured", measured=site.measured,
+                                    explanations=measured.MEASURED_COLUMNS)
     return files | {name: (PACKAGE / "report" / name).read_bytes()
                     for name in ("style.css", "script.js")}
 
@@ -146,13 +148,13 @@ def render(site: Site) -> dict[str, str]:
             seeds = f", {board.seeds}" if board.seeds else ""
             parts += [f"### {as_markdown(board.title)}{seeds}",
                       tables.markdown_table(board).markdown()]
-    parts += [*robustness.text(site.boards), *measured.text(site.measured)]
+    parts += [*robustness.markdown_section(site.boards), *measured.markdown_section(site.measured)]
     if site.boards:
-        parts += ["## Column descriptions", markdown_list(meanings())]
+        parts += ["## Column descriptions", markdown_list(column_descriptions())]
     if outdated := newest(site.records)[1]:
         parts += ["## Superseded records", "Made by an earlier version of the method.\n\n"
                   + "\n".join(f"- {as_markdown(file_name(record))}" for record in outdated)]
-    table = board_table(site.boards)
+    table = leaderboard_table(site.boards)
     texts = {name: table[name].map(as_cell) for name in ("environment", "method", "title")}
     plain = table.assign(**texts).to_csv(index=False, float_format="%.6g", lineterminator="\n")
     return {"leaderboard.csv": plain, "leaderboard.md": "\n\n".join(parts) + "\n"}
@@ -168,7 +170,7 @@ def write_site(folder: Path, files: Mapping[str, bytes]) -> None:
         If the folder is neither empty nor such a site: then it is not touched.
     """
     index = folder / "index.html"
-    is_site = index.is_file() and MARK in index.read_bytes()
+    is_site = index.is_file() and SITE_MARKER in index.read_bytes()
     if folder.exists() and any(folder.iterdir()) and not is_site:
         raise ValueError("folder must be empty or hold a site of the leaderboards, since other "
                          f"files in it are deleted; {folder} holds something else")
@@ -183,7 +185,7 @@ class KeyFigure(NamedTuple):
 
     value: str
     about: str
-    board: Board
+    board: Leaderboard
 
 
 class Headline(NamedTuple):
@@ -197,7 +199,7 @@ class Headline(NamedTuple):
 def index_page(site: Site) -> bytes:
     """Return the HTML of ``index.html``."""
     shown = {name: [(board, tables.page_table(board, "", compact=True),
-                     tables.Axes.of(board).drawn()) for board in boards]
+                     tables.ScoreAxes.of(board).headers()) for board in boards]
              for name, boards in site.classes.items()}
     top = headline(site)
     return site.page(
@@ -205,9 +207,10 @@ def index_page(site: Site) -> bytes:
         moving=site.picture(HEADLINE[0], ""), still=site.picture(HEADLINE[1], ""),
         n_environments=sum(not board.is_aggregate for board in site.boards),
         n_records=len(site.records),
-        n_methods=len({record["method"] for record in site.records}), classes=shown, about=ABOUT,
-        robustness=ROBUSTNESS if robustness.families(site.boards) else "",
-        measured=MEASURED if site.measured.records else "",
+        n_methods=len({record["method"] for record in site.records}), classes=shown,
+        about=CATEGORY_TEXTS,
+        robustness=ROBUSTNESS_PAGE if robustness.shift_families(site.boards) else "",
+        measured=MEASURED_PAGE if site.measured.records else "",
         last=max(map(finished, site.records), default="")[:10],
         explanations=tables.explanations(table for boards in shown.values()
                                          for _, table, _ in boards))
@@ -215,12 +218,12 @@ def index_page(site: Site) -> bytes:
 
 def headline(site: Site) -> Headline | None:
     """Return how many times a flow model reduces the error; None without official records."""
-    board = site.board("filter", PIPE)
+    board = site.board("filter", HEADLINE_ENVIRONMENT)
     errors = {row.cells["method"]: row.cells["error"] for row in (board.rows if board else ())
               if row.cells["official"] and row.complete}
-    if board is None or not set(COMPARED) <= errors.keys():
+    if board is None or not set(HEADLINE_METHODS) <= errors.keys():
         return None
-    flat, stationary, filtered = (errors[name] for name in COMPARED)
+    flat, stationary, filtered = (errors[name] for name in HEADLINE_METHODS)
     times = stationary / filtered
     if not 2 <= times < len(MULTIPLES) + 2:
         return None
@@ -237,21 +240,21 @@ def headline(site: Site) -> Headline | None:
 
 def key_figures(site: Site) -> list[KeyFigure]:
     """Return up to two: gains of the best filter and of the best trained agent."""
-    def best(board: Board | None, *, trained: bool | None = None) -> tables.Line | None:
-        return next((line for line in (tables.lines(board) if board else ()) if line.row.competes
-                     and trained in (None, bool(line.parts))), None)
+    def best(board: Leaderboard | None, *, trained: bool | None = None) -> tables.AgentRow | None:
+        return next((line for line in (tables.group_by_agent(board) if board else ())
+                     if line.row.is_ranked and trained in (None, bool(line.parts))), None)
 
-    def percent(line: tables.Line) -> str:
+    def percent(line: tables.AgentRow) -> str:
         return f"{100 * line.row.cells['gain']:.0f} %"
 
     found = []
     board = site.board("filter", ALL)
     if board and (first := best(board)):
-        count = sum(each.of_class == "filter" and each.environment in counted()
+        count = sum(each.category == "filter" and each.environment in aggregate_environments()
                     for each in site.boards)
         found.append(KeyFigure(percent(first), "less error than the floor with the best filter "
                                f"({first.row.cells['title']}), over {count} environments", board))
-    board = site.board("injection", AGENTS)
+    board = site.board("injection", AGENT_ENVIRONMENT)
     agent, rule = best(board, trained=True), best(board, trained=False)
     if board and agent and rule:
         found.append(KeyFigure(
@@ -264,7 +267,7 @@ def key_figures(site: Site) -> list[KeyFigure]:
 # -- environments ----------------------------------------------------------------------------------
 
 
-def environment_page(site: Site, board: Board) -> bytes:
+def environment_page(site: Site, board: Leaderboard) -> bytes:
     """Return the HTML of the page of an environment."""
     id = board.records[0]["environment"]["id"]
     table = tables.page_table(board, "../")
@@ -272,13 +275,13 @@ def environment_page(site: Site, board: Board) -> bytes:
     animation = f"{board.environment}.webp"
     return site.page(
         "environment", "../", board=board, id=id, description=description, details=details,
-        table=table, axes=tables.Axes.of(board).drawn(),
+        table=table, axes=tables.ScoreAxes.of(board).headers(),
         explanations=tables.explanations([table]),
         front=tables.cost_chart(board), curves=tables.curve_chart(board),
         moving=site.picture(animation, "../"),
         media_mb=f"{1e-6 * site.media.get(animation, 0):.1f} MB",
-        robustness=ROBUSTNESS if home_of(id) and named(id, {}) == board.environment else "",
-        siblings=[other for other in site.classes[board.of_class]
+        robustness=ROBUSTNESS_PAGE if home_of(id) and named(id, {}) == board.environment else "",
+        siblings=[other for other in site.classes[board.category]
                   if other is not board and not other.is_aggregate])
 
 
@@ -306,26 +309,26 @@ def method_page(site: Site, name: str) -> bytes:
     table, axes = _placements(placements)
     return site.page(
         "method", "../", name=name, title=records[0]["title"], placements=table, axes=axes,
-        checkout="../../../" if METHODS in site.beside else "",
+        checkout="../../../" if METHODS_FOLDER in site.assets else "",
         versions=[_version(own, addresses) for own in versions.values()])
 
 
-def _placements(placements: list[tuple[Board, tables.Row]]) -> tuple[Table, dict[str, Markup]]:
+def _placements(placements: list[tuple[Leaderboard, MethodRow]]) -> tuple[Table, dict[str, Markup]]:
     """Return one row for each board, and the axes of gains, which all rows share."""
-    gains = tables.Axes.of(Board("", ALL, "", [row for _, row in placements]))
+    gains = tables.ScoreAxes.of(Leaderboard("", ALL, "", [row for _, row in placements]))
     rows = []
     for board, row in placements:
         rank = row.cells["rank"]
         link = f"../index.html#{board.anchor}" if board.is_aggregate else f"../{board.address}"
         rows.append({
             "board": Cell(board.title, board.title.casefold(), link=link,
-                          small=f"{board.of_class} · {row.cells['version']}", badges=row.badges),
+                          small=f"{board.category} · {row.cells['version']}", badges=row.badges),
             "rank": Cell(NOTHING) if rank is None else Cell(
-                str(rank), float(rank), small=f"of {sum(each.competes for each in board.rows)}"),
-            "ẽ_c": tables.Axes.of(board).cell(row, "error"), "gain": gains.cell(row, "gain"),
+                str(rank), float(rank), small=f"of {sum(each.is_ranked for each in board.rows)}"),
+            "ẽ_c": tables.ScoreAxes.of(board).cell(row, "error"), "gain": gains.cell(row, "gain"),
             "ms/step": number_cell(row.cells["seconds_per_step"])})
     table = Table.of(rows, label="Boards", keep=list(rows[0]) if rows else ())
-    return table, {"gain": gains.drawn()["gain"]}
+    return table, {"gain": gains.headers()["gain"]}
 
 
 def _version(records: list[dict[str, Any]], addresses: dict[tuple[str, str], str],
@@ -338,7 +341,7 @@ def _version(records: list[dict[str, Any]], addresses: dict[tuple[str, str], str
         runs = [group[0] | {"products": sorted(1000 * run["machine"]["matmul_seconds"]
                                                for run in group)} for group in alike(each["runs"])]
         shown.append({
-            "title": title_of(each), "official": each["official"], "runs": runs,
+            "title": environment_title(each), "official": each["official"], "runs": runs,
             "file": file_name(each), "episodes": _episodes(each),
             "address": addresses.get((each["environment"]["name"], each["version"])),
             "commands": sorted({run["command"] for run in each["runs"]}),
@@ -358,7 +361,8 @@ def _episodes(record: dict[str, Any]) -> Table:
         "seed": Cell(episode["seed"], float(i)), "status": episode["status"],
         **{heading: number_cell(own.get(episode["seed"])) for heading, own in values.items()},
         "date": Cell(episode["finished"][:10], episode["finished"]),
-    } for i, episode in enumerate(record["episodes"])], label=f"Episodes of {title_of(record)}")
+    } for i, episode in enumerate(record["episodes"])],
+        label=f"Episodes of {environment_title(record)}")
 
 
 def source_file(record: dict[str, Any]) -> str:

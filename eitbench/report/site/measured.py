@@ -21,7 +21,7 @@ from eitbench.bench.tracks import registered
 from eitbench.measured.cases import MeasuredCase, read_case
 from eitbench.report.templates import markdown_list
 
-MEANINGS = {each.heading: each.explanation for each in scores("measured").values()
+MEASURED_COLUMNS = {each.heading: each.explanation for each in scores("measured").values()
             if each.name != "error"} | {
     "relative":
         "withheld RMSE relative to that of the best naive baseline, geometric mean over the cases "
@@ -31,16 +31,16 @@ MEANINGS = {each.heading: each.explanation for each in scores("measured").values
 """Explanations of the board's headings and marks."""
 
 
-class Measured(NamedTuple):
+class MeasuredBoards(NamedTuple):
     """Cases that have records, with their records: the smallest withheld RMSE first."""
 
     cases: dict[str, MeasuredCase]
     records: dict[str, list[dict[str, Any]]]
-    complaints: list[str]
+    errors: list[str]
     """A sentence for each invalid file."""
 
     @classmethod
-    def of(cls, leaderboards: Path) -> Measured:
+    def of(cls, leaderboards: Path) -> MeasuredBoards:
         """Read the records in the folder ``results`` of the leaderboards."""
         found, complaints = read_sound_files(leaderboards / "results", measured=True)
         latest = {(record["environment"]["id"], record["method"]): record
@@ -59,9 +59,9 @@ class Measured(NamedTuple):
     def case_table(self, name: str) -> Table:
         """Return the table of the methods of a case."""
         return Table.of([{
-            "method": _method(record, record["title"]),
-            **_cell(record, "prediction_error", spread=True), **_cell(record, "nis"),
-            **_cell(record, "ktc"),
+            "method": _method_cell(record, record["title"]),
+            **_score_cell(record, "prediction_error", spread=True), **_score_cell(record, "nis"),
+            **_score_cell(record, "ktc"),
             "ms/step": number_cell(min(scores_by_seed(record, "seconds_per_step").values()))}
             for record in self.records[name]], label=self.cases[name].title)
 
@@ -81,13 +81,13 @@ class Measured(NamedTuple):
         methods = {_label(record): record for records in self.records.values()
                    for record in reversed(records)}
         return Table.of([{
-            "method": _method(methods[label]),
+            "method": _method_cell(methods[label]),
             **{name: number_cell(value) for name, value in each.loc[label].items()},
             "relative": number_cell(relative[label])}
             for label in order], label="all cases")
 
 
-NOBODY = Measured({}, {}, [])
+EMPTY = MeasuredBoards({}, {}, [])
 
 
 def withheld_rmse(record: dict[str, Any]) -> float:
@@ -95,7 +95,7 @@ def withheld_rmse(record: dict[str, Any]) -> float:
     return fmean(scores_by_seed(record, "prediction_error").values())
 
 
-def text(measured: Measured) -> list[str]:
+def markdown_section(measured: MeasuredBoards) -> list[str]:
     """Render the section of the boards as Markdown, in parts; none without records."""
     if not measured.records:
         return []
@@ -105,14 +105,14 @@ def text(measured: Measured) -> list[str]:
     for name, case in measured.cases.items():
         parts += [f"### {name}", f"{case.title}. Data: {case.source}, {case.file}; licence: "
                   f"{case.licence}.", measured.case_table(name).markdown()]
-    return [*parts, markdown_list(MEANINGS)]
+    return [*parts, markdown_list(MEASURED_COLUMNS)]
 
 
 def _label(record: dict[str, Any]) -> str:
     return f"{record['method']}@{record['version']}"
 
 
-def _cell(record: dict[str, Any], score: str, *, spread: bool = False) -> dict[str, Cell]:
+def _score_cell(record: dict[str, Any], score: str, *, spread: bool = False) -> dict[str, Cell]:
     """Heading and mean of a score, with the least and the largest value where they matter."""
     values = list(scores_by_seed(record, score).values())
     cell = number_cell(fmean(values) if values else None)
@@ -121,7 +121,7 @@ def _cell(record: dict[str, Any], score: str, *, spread: bool = False) -> dict[s
     return {scores("measured")[score].heading: cell}
 
 
-def _method(record: dict[str, Any], title: str = "") -> Cell:
+def _method_cell(record: dict[str, Any], title: str = "") -> Cell:
     """Name and version with badges, below a title if there is one."""
     badges = [*filter(None, [record["role"]]), *["self-reported"] * (not record["official"])]
     shown = title or _label(record)

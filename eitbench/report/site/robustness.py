@@ -18,18 +18,18 @@ from markupsafe import Markup
 from eitbench.bench.table import NOTHING, Cell, Table, number_cell
 from eitbench.bench.text import number
 from eitbench.bench.tracks import home_of, ids, named
-from eitbench.report.boards import Board, Row, kind_of
-from eitbench.report.tables import by_author, flags, method_cell
+from eitbench.report.boards import Leaderboard, MethodRow, base_environment
+from eitbench.report.tables import author_badges, filter_flags, method_cell
 from eitbench.report.templates import markdown, markdown_list
 from eitbench.worlds.registry import entry
 
-BELOW = "below the floor"
-MEANINGS = {
+WORSE_THAN_NAIVE = "below the floor"
+ROBUSTNESS_COLUMNS = {
     "nominal": "ẽ_c in the world of the model: squared distance from the truth over the square of "
                "the truth, mean over the episodes; lower is better",
     "a shift": "ẽ_c where one property differs from the model and from the training episodes, and "
                "its ratio to the nominal one",
-    BELOW: "ẽ_c is larger than that of the best floor in the same world",
+    WORSE_THAN_NAIVE: "ẽ_c is larger than that of the best floor in the same world",
     "mean gain": "gain over the floor in the same world, as on the boards (0 as the floor, 1 "
                  "perfect): the mean of all shifts",
     "least gain": "the least of these gains, and its shift; the board is ordered by it. Methods "
@@ -40,14 +40,14 @@ MEANINGS = {
 """Heading or mark -> explanation."""
 
 
-class Family(NamedTuple):
+class ShiftFamily(NamedTuple):
     """A nominal world and its shifts."""
 
     home: str
     """id"""
-    nominal: Board | None
+    nominal: Leaderboard | None
     """None without a record"""
-    shifts: dict[str, Board]
+    shifts: dict[str, Leaderboard]
     """Heading -> board, of those with records, in the order of registration."""
 
     @property
@@ -55,7 +55,7 @@ class Family(NamedTuple):
         """Heading -> the first paragraph of the description of a shift."""
         texts = {name: entry(board.records[0]["environment"]["id"]).description
                  for name, board in self.shifts.items()}
-        return {name: markdown(text.strip().split("\n\n")[0]) for name, text in texts.items()}
+        return {name: markdown(about.strip().split("\n\n")[0]) for name, about in texts.items()}
 
     @property
     def table(self) -> Table:
@@ -63,7 +63,7 @@ class Family(NamedTuple):
         nominal = {row.label: row for row in self.nominal.rows} if self.nominal else {}
         shifted = {name: {row.label: row for row in board.rows}
                    for name, board in self.shifts.items()}
-        floors = {name: _best_floor(board) for name, board in self.shifts.items()}
+        floors = {name: _best_naive_error(board) for name, board in self.shifts.items()}
         lines: list[tuple[float, dict[str, Cell | str], str]] = []
         for label in dict.fromkeys(label for rows in shifted.values() for label in rows):
             home = nominal.get(label)
@@ -71,48 +71,49 @@ class Family(NamedTuple):
             gains = {name: row.cells["gain"] for name, row in own.items()
                      if row.complete and row.cells["gain"] is not None}
             row = home or next(iter(own.values()))
-            cells: dict[str, Cell | str] = {"method": method_cell(row, "", more=by_author(row)),
-                                            "nominal": _error(home)}
-            cells |= {name: _error(own.get(name), home, floors[name]) for name in self.shifts}
+            cells: dict[str, Cell | str] = {"method": method_cell(row, "", more=author_badges(row)),
+                                            "nominal": _error_cell(home)}
+            cells |= {name: _error_cell(own.get(name), home, floors[name]) for name in self.shifts}
             least = min(gains, key=gains.__getitem__) if gains.keys() == shifted.keys() else ""
             cells["mean gain"] = number_cell(fmean(gains.values()) if least else None)
             cells["least gain"] = Cell(number(gains[least]), gains[least],
                                        small=least) if least else Cell(NOTHING)
-            lines.append((-gains[least] if least else math.inf, cells, flags(row)))
+            lines.append((-gains[least] if least else math.inf, cells, filter_flags(row)))
         lines.sort(key=lambda line: line[0])
         return Table.of([cells for _, cells, _ in lines], keep=["nominal"],
-                        label=f"{kind_of(self.home)} and its shifts",
+                        label=f"{base_environment(self.home)} and its shifts",
                         flags=[flag for *_, flag in lines])
 
 
-def families(boards: Iterable[Board]) -> list[Family]:
+def shift_families(boards: Iterable[Leaderboard]) -> list[ShiftFamily]:
     """Return the registered ids with a nominal id that have boards, grouped by it."""
     of_environment = {board.environment: board for board in boards if not board.is_aggregate}
-    found: dict[str, Family] = {}
+    found: dict[str, ShiftFamily] = {}
     for id in ids():
         home = home_of(id)
         board = of_environment.get(named(id, {}))
         if home and board:
             nominal = of_environment.get(named(home, {}))
-            family = found.setdefault(home, Family(home, nominal, {}))
-            family.shifts[heading(id, home)] = board
+            family = found.setdefault(home, ShiftFamily(home, nominal, {}))
+            family.shifts[shift_heading(id, home)] = board
     return list(found.values())
 
 
-def heading(id: str, home: str) -> str:
+def shift_heading(id: str, home: str) -> str:
     """``eitbench/Pipe2DShortSlugs-v0`` -> ``short slugs``."""
-    words = kind_of(id).removeprefix(kind_of(home)) or kind_of(id)
+    words = base_environment(id).removeprefix(base_environment(home)) or base_environment(id)
     return re.sub(r"(?<=[a-z])(?=[A-Z])", " ", words).lower()
 
 
-def _best_floor(board: Board) -> float:
+def _best_naive_error(board: Leaderboard) -> float:
     """Return the least ẽ_c of a board's floors, official ones where there are any; else ∞."""
     floors = [row for row in board.rows if "floor" in row.badges and row.complete]
     official = [row for row in floors if row.cells["official"]]
     return min((row.cells["error"] for row in official or floors), default=math.inf)
 
 
-def _error(row: Row | None, home: Row | None = None, floor: float = math.inf) -> Cell:
+def _error_cell(row: MethodRow | None, home: MethodRow | None = None,
+                floor: float = math.inf) -> Cell:
     """Return ẽ_c, its ratio to the nominal one, and marks: worse than the floor, unfinished."""
     if row is None:
         return Cell(NOTHING)
@@ -120,20 +121,20 @@ def _error(row: Row | None, home: Row | None = None, floor: float = math.inf) ->
     lacks = [word for word in row.badges if "failed" in word or "missing" in word]
     if error is None:
         return Cell(NOTHING, badges=tuple(lacks))
-    below = [BELOW] if "floor" not in row.badges and error > floor else []
+    below = [WORSE_THAN_NAIVE] if "floor" not in row.badges and error > floor else []
     ratio = ""
     if home and home.complete and row.complete and home.cells["error"]:
         ratio = f"× {number(error / home.cells['error'])}"
     return Cell(number(error), error, small=ratio, badges=(*below, *lacks))
 
 
-def text(boards: Iterable[Board]) -> list[str]:
+def markdown_section(boards: Iterable[Leaderboard]) -> list[str]:
     """Return the Markdown section in parts; nothing without a record of a shift."""
-    found = families(boards)
+    found = shift_families(boards)
     if not found:
         return []
     parts = ["## robustness", "Scores where the truth differs from the model, beside nominal ones; "
              "ordered by the least gain over the floor in the same world."]
     for family in found:
         parts += [f"### {family.table.label}", family.table.markdown()]
-    return [*parts, markdown_list(MEANINGS)]
+    return [*parts, markdown_list(ROBUSTNESS_COLUMNS)]
