@@ -40,7 +40,7 @@ def estimate(
     still: Annotated[bool, typer.Option("--still", help="The target does not move.")] = False,
     correction: Annotated[str, typer.Option(
         help="Correction of the misfit on homogeneous fluid: subtract an offset or divide by a "
-             "channel gain (offset or gain).")] = "offset",
+             "channel gain (offset or gain), or none for absolute images.")] = "offset",
     homogeneous_frames: Annotated[int, typer.Option(
         min=1, help="Number of first frames of homogeneous fluid, without a reference.")] = 1,
 ) -> None:
@@ -72,7 +72,9 @@ def estimate(
             kept = plotted_steps(env) if arrays is None else None
             run = run_on_measurements(env, name, seed, kept=kept)
             runs.append(run)
-            options.say(f"{run.method}: withheld RMSE {run.withheld_rmse:.2f} noise std")
+            score = ("no measurement is withheld, so nothing is scored" if not env.withheld
+                     else f"withheld RMSE {run.withheld_rmse:.2f} noise std")
+            options.say(f"{run.method}: {score}")
             if run.velocity is not None:
                 velocity = ", ".join(f"{each:.3g}" for each in run.velocity[-1])
                 options.say(f"  mean velocity at the end {velocity} m/s")
