@@ -32,7 +32,8 @@ from eitbench.worlds.task import Task
 NOISE_FRAMES = 1000
 """The noise is estimated from the first frames, at most so many."""
 NO_REFERENCE = ("There is no homogeneous frame: the frame is its own reference, so that images "
-                "show no target, and nothing is scored. The correction 'none' gives absolute images.")
+                "show no target, and nothing is scored. The correction 'none' gives an absolute "
+                "image.")
 WITHHOLDING_SEEDS = 100_000
 """Size of a split of seeds: ``test:3``, ``dev:3`` and ``train:3`` withhold the same readings."""
 
