@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import math
 from collections.abc import Collection, Iterable
 from dataclasses import dataclass
 from pathlib import Path
@@ -49,8 +50,10 @@ class MeasuredRun:
 
     @property
     def withheld_rmse(self) -> float:
-        """RMS residual of all withheld readings that are scored; 1 is the noise level."""
-        return float(np.sqrt(np.nanmean(self.withheld_residual_rms**2)))
+        """RMS residual of all withheld readings that are scored; 1 is the noise level, NaN without
+        any."""
+        scored = self.withheld_residual_rms[np.isfinite(self.withheld_residual_rms)]
+        return float(np.sqrt(np.mean(scored**2))) if len(scored) else math.nan
 
     def mean_nis(self, warm_up: int) -> float | None:
         """Mean NIS/m after the warm-up; None if the method has no innovations."""
@@ -172,6 +175,8 @@ def _nis(env: MeasuredEnv, t: int, estimate: Estimate) -> float:
     """NIS relative to the number of readings shown; hidden ones have an innovation of 0."""
     if estimate.innovation is None or estimate.innovation_covariance is None:
         return float("nan")
-    whitened = np.linalg.solve(estimate.innovation_covariance, estimate.innovation)
-    count = int(env.model.mask[env.measurements.injection_index[t - 1]].sum())
-    return float(estimate.innovation @ whitened) / count if count else float("nan")
+    known = np.isfinite(estimate.innovation)
+    innovation = estimate.innovation[known]
+    whitened = np.linalg.solve(estimate.innovation_covariance[np.ix_(known, known)], innovation)
+    count = int((env.model.mask[env.measurements.injection_index[t - 1]] & known).sum())
+    return float(innovation @ whitened) / count if count else float("nan")

@@ -199,7 +199,7 @@ def _estimates(env: EstimationEnv | MeasuredEnv, estimator: Method, seed: int,
             raise ValueError("Estimator.update must return an Estimate once a state is asked for; "
                              f"at t = {t} it returned None")
         if estimate is not None:
-            _check_estimate(estimate, env.task, len(seen["voltages"]))
+            _check_estimate(estimate, env.task, np.isfinite(seen["voltages"]))
             if estimate.variance is not None:
                 env.estimate_std = np.sqrt(estimate.variance)
         observation, _, done, _, _ = env.step(_action(env.task, estimate, silence))
@@ -215,7 +215,8 @@ def _action(task: Task, estimate: Estimate | None, silence: np.ndarray) -> np.nd
     return np.concatenate([mean, task.velocity.nominal if velocity is None else velocity])
 
 
-def _check_estimate(estimate: Any, task: Task, readings: int) -> None:
+def _check_estimate(estimate: Any, task: Task, measured: np.ndarray) -> None:
+    """Check an estimate; the innovation may be NaN where nothing was ``measured`` (m,)."""
     n = task.mesh.n_nodes
     if not isinstance(estimate, Estimate):
         raise ValueError("Estimator.update must return an Estimate or None, got "
@@ -229,9 +230,13 @@ def _check_estimate(estimate: Any, task: Task, readings: int) -> None:
                                  f"got {value!r}")
             _check.array(f"Estimate.{name}", value, (task.velocity.n_parameters,))
     if innovation is not None:
-        _check.array("Estimate.innovation", innovation, (readings,), units="V")
+        innovation = _check.array("Estimate.innovation", innovation, measured.shape, units="V",
+                                  allow_nan=not measured.all())
+        if np.isnan(innovation[measured]).any():
+            raise ValueError("Estimate.innovation must be finite where a voltage was measured, got "
+                             "NaN")
     if covariance is not None:
-        _check_covariance(covariance, readings)
+        _check_covariance(covariance, len(measured))
     if variance is not None and not (np.shape(variance) == (n,) and np.isfinite(variance).all()
                                      and (np.asarray(variance) >= 0).all()):
         raise ValueError(f"Estimate.variance must be finite, ≥ 0 and of shape ({n},), got shape "

@@ -24,6 +24,10 @@ def estimate(
              "until then.")] = None,
     format: Annotated[str | None, typer.Option(
         help="hdf5, ktc, eidors, sciospec or table. Default: detected.")] = None,
+    option: Annotated[list[str] | None, typer.Option(
+        "--option", help="Argument NAME=VALUE of the file's reader, such as name=VARIABLE and "
+                         "reference=VARIABLE of an EIDORS file, or frequency=1e4 of Sciospec "
+                         "files; may be repeated.")] = None,
     withheld: Annotated[float, typer.Option(
         min=0.0, max=0.5, help="Fraction of the readings that is withheld from the methods and "
                                "scores them.")] = 0.1,
@@ -36,7 +40,7 @@ def estimate(
     still: Annotated[bool, typer.Option("--still", help="The target does not move.")] = False,
     correction: Annotated[str, typer.Option(
         help="Correction of the misfit on homogeneous fluid: subtract an offset or divide by a "
-             "channel gain (offset or gain).")] = "offset",
+             "channel gain (offset or gain), or none for absolute images.")] = "offset",
     homogeneous_frames: Annotated[int, typer.Option(
         min=1, help="Number of first frames of homogeneous fluid, without a reference.")] = 1,
 ) -> None:
@@ -51,7 +55,8 @@ def estimate(
     with options.clear_errors():
         if out.suffix != ".html":
             raise ValueError(f"--out must end in .html, got {out}")
-        measurements = read(file, format, None if span is None else _steps(span))
+        measurements = read(file, format, None if span is None else _steps(span),
+                            **_reader_options(option or []))
         T, M = measurements.voltages.shape
         options.say(f"{file}: {T} times {M} readings of {measurements.currents.shape[1]} "
                     f"electrodes; a method takes about {10 + 0.03 * T:.0f} s")
@@ -67,7 +72,9 @@ def estimate(
             kept = plotted_steps(env) if arrays is None else None
             run = run_on_measurements(env, name, seed, kept=kept)
             runs.append(run)
-            options.say(f"{run.method}: withheld RMSE {run.withheld_rmse:.2f} noise std")
+            score = ("no measurement is withheld, so nothing is scored" if not env.withheld
+                     else f"withheld RMSE {run.withheld_rmse:.2f} noise std")
+            options.say(f"{run.method}: {score}")
             if run.velocity is not None:
                 velocity = ", ".join(f"{each:.3g}" for each in run.velocity[-1])
                 options.say(f"  mean velocity at the end {velocity} m/s")
@@ -78,6 +85,20 @@ def estimate(
         if arrays is not None:
             runs[0].save(arrays, env)
             options.say(f"wrote {arrays}")
+
+
+def _reader_options(texts: list[str]) -> dict[str, float | str]:
+    """Parse ``NAME=VALUE``; a value that is a number becomes one."""
+    parsed: dict[str, float | str] = {}
+    for text in texts:
+        name, equals, value = text.partition("=")
+        if not equals or not name.isidentifier():
+            raise ValueError(f"--option must be NAME=VALUE, got {text!r}")
+        try:
+            parsed[name] = int(value) if value.isdigit() else float(value)
+        except ValueError:
+            parsed[name] = value
+    return parsed
 
 
 def _steps(span: str) -> slice:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,7 @@ from eitbench.measured.calibration import calibrate, noise_from_frames
 from eitbench.measured.cases import MeasuredCase, read_case
 from eitbench.measured.model import (
     MeasurementModel,
-    complete_channels,
+    available_channels,
     sample_withheld,
     visible_measurement,
 )
@@ -30,6 +31,9 @@ from eitbench.worlds.task import Task
 
 NOISE_FRAMES = 1000
 """The noise is estimated from the first frames, at most so many."""
+NO_REFERENCE = ("There is no homogeneous frame: the frame is its own reference, so that images "
+                "show no target, and nothing is scored. The correction 'none' gives an absolute "
+                "image.")
 WITHHOLDING_SEEDS = 100_000
 """Size of a split of seeds: ``test:3``, ``dev:3`` and ``train:3`` withhold the same readings."""
 
@@ -45,8 +49,9 @@ class MeasuredEnv(FixedLengthEnv):
 
     ## Observation Space
 
-    A `Dict` with the readings, (M,) V, and currents, (L,) A, of the active injection. Readings that
-    are withheld or missing are 0; the mask of the task's `MeasurementModel` tells which.
+    A `Dict` with the voltages, (M,) V, and currents, (L,) A, of the active injection. Channels that
+    are withheld or never measured are 0; the mask of the task's `MeasurementModel` names them. A
+    single measurement that was lost, or is a spike, is NaN.
 
     ## Rewards
 
@@ -70,7 +75,7 @@ class MeasuredEnv(FixedLengthEnv):
     | `vessel` | | a file or mapping for `read_vessel`, or a `VesselConfig` |
     | `withheld` | 0.1 | withheld fraction of the readings, from 0 to 0.5 |
     | `moves` | None | whether the target moves; None: with two complete frames or more, or a flow |
-    | `correction` | "offset" | of the misfit on homogeneous fluid; or "gain", see `calibrate` |
+    | `correction` | "offset" | of the misfit on homogeneous fluid; see `calibrate` |
     | `homogeneous_frames` | 1 | number of first frames that replace a missing reference |
     | `render_mode` | None | "rgb_array": last estimate, standard deviation, active electrodes |
 
@@ -87,10 +92,15 @@ class MeasuredEnv(FixedLengthEnv):
                  homogeneous_frames: int = 1, render_mode: str | None = None,
                  **options: Any) -> None:
         self.check_render(render_mode)
-        self.measurements = file if isinstance(file, Measurements) else read(file)
+        measurements = file if isinstance(file, Measurements) else read(file)
         self.vessel = vessel if isinstance(vessel, VesselConfig) else read_vessel(vessel)
         self.case: MeasuredCase | None = None
-        measurements = self.measurements
+        spikes = quality.find_spikes(measurements)
+        self._warnings = quality.spike_warnings(measurements, spikes)
+        if spikes.any():
+            measurements = replace(measurements,
+                                   voltages=np.where(spikes, np.nan, measurements.voltages))
+        self.measurements = measurements
         T, (M, L) = len(measurements.injection_index), measurements.matrix.shape
         if self.vessel.n_electrodes != L:
             raise ValueError(f"vessel must have the {L} electrodes of the measurements, got "
@@ -106,8 +116,15 @@ class MeasuredEnv(FixedLengthEnv):
         if moves is None:
             moves = self.vessel.flow is not None or 2 * measurements.frame_length <= T
         self._options = {"moves": moves, **options}
-        self.available = complete_channels(measurements)
-        """(K, M) bool: readings that exist at every use of their injection"""
+        is_own_reference = (measurements.reference is None and correction != "none"
+                            and homogeneous_frames * measurements.frame_length >= T)
+        if is_own_reference:
+            self._warnings.append(NO_REFERENCE)
+            self.withheld = 0.0
+        self.available = available_channels(measurements)
+        """(K, M) bool: channels that are measured, see `available_channels`"""
+        if correction != "none":
+            self.available &= np.isfinite(self.calibration.mean_voltages)
         self.episode_steps = T
         self.estimate_std: np.ndarray | None = None
         """(n,) standard deviation of the last estimate in mol/m³, if the caller has one"""
@@ -192,7 +209,8 @@ class MeasuredEnv(FixedLengthEnv):
 
     def quality_warnings(self) -> list[str]:
         """Return data-quality warnings; see `eitbench.measured.quality`."""
-        return quality.quality_warnings(self.measurements, self.calibration, self._electrodes)
+        return [*self._warnings, *quality.quality_warnings(self.measurements, self.calibration,
+                                                           self._electrodes)]
 
     def scoring_steps(self, t: int) -> range:
         """Return the injections, 1 … T, whose withheld readings score an estimate at t."""
@@ -203,8 +221,9 @@ class MeasuredEnv(FixedLengthEnv):
     def withheld_residuals(self, t: int, estimate: np.ndarray) -> np.ndarray:
         """Residuals of an estimate (n,) at the readings withheld at t = 1 … T, relative to the
         standard deviation of their noise."""
-        injection = self.measurements.injection_index[t - 1]
-        return self.residuals(t, estimate)[self.withheld_mask[injection]]
+        withheld = self.withheld_mask[self.measurements.injection_index[t - 1]]
+        residuals = self.residuals(t, estimate)[withheld]
+        return residuals[np.isfinite(residuals)]
 
     def residuals(self, t: int, estimate: np.ndarray) -> np.ndarray:
         """(M,) residuals of an estimate (n,) at all readings of t = 1 … T, relative to the

@@ -27,7 +27,8 @@ def gauss_newton(model: VoltageModel, voltages: np.ndarray, currents: np.ndarray
     ----------
     model : VoltageModel
     voltages, currents, noise_std : (K, L)
-        One frame: measurements in V, injections in A (A/m in 2D), standard deviations in V.
+        One frame: measurements in V, NaN where one is missing, injections in A (A/m in 2D),
+        standard deviations in V.
     penalty : (n, n) sparse or dense
         α² L_cᵀL_c; for the smoothness prior α² times the stiffness matrix, ∫|∇c|².
     start : (n,)
@@ -36,7 +37,9 @@ def gauss_newton(model: VoltageModel, voltages: np.ndarray, currents: np.ndarray
         Stop when a full step would lower the objective by less than this part of it.
     """
     normal = _NormalEquations(penalty)
-    weight = (1.0 / noise_std).ravel()
+    missing = np.isnan(voltages)
+    weight = np.where(missing, 0.0, 1.0 / noise_std).ravel()
+    voltages = np.nan_to_num(voltages)
     c = np.array(start, dtype=float)
 
     def misfit(c: np.ndarray, computed: np.ndarray) -> float:

@@ -25,14 +25,15 @@ def best_homogeneous(model: VoltageModel, noise: VoltageNoise, n: int, voltages:
     n : int
         Number of nodes.
     voltages, currents : (K, L)
-        Measurements in V and injections in A (A/m in 2D).
+        Measurements in V, NaN where one is missing, and injections in A (A/m in 2D).
     start : float
         First guess in mol/m³, > 0.
     """
     # Injections repeat: R(c·1) is needed once for each distinct pattern.
     patterns, which = np.unique(currents, axis=0, return_inverse=True)
     which = which.reshape(-1)
-    weight = 1.0 / noise.std(voltages)
+    weight = np.isfinite(voltages) / noise.std(np.nan_to_num(voltages))
+    voltages = np.nan_to_num(voltages)
     c = float(start)
     for _ in range(max_iterations):
         computed, jacobian = model.linearise(np.full(n, c), patterns)

@@ -11,7 +11,7 @@ from eitbench import _check
 from eitbench.physics.cem import CompleteElectrodeModel
 from eitbench.physics.observation import VoltageNoise
 
-CORRECTIONS = ("offset", "gain")
+CORRECTIONS = ("offset", "gain", "none")
 CONTACT_PRIOR_MEAN = 0.1
 """Prior mean of z σ relative to the electrode's length."""
 CONTACT_PRIOR_LOG_STD = 2.0
@@ -52,14 +52,14 @@ class Calibration:
     def offset(self) -> np.ndarray:
         """(K, M) V subtracted from measurements, 0 where nothing was measured: the mean
         approximation error of the model (Kaipio & Somersalo 2005)."""
-        if self.correction == "gain":
+        if self.correction != "offset":
             return np.zeros_like(self.mean_voltages)
         return np.nan_to_num(self.mean_voltages - self.model_voltages)
 
     @property
     def channel_gain(self) -> np.ndarray:
         """(K, M) ratio of each measurement to the model for the correction "gain", else 1."""
-        if self.correction == "offset":
+        if self.correction != "gain":
             return np.ones_like(self.mean_voltages)
         return np.nan_to_num(self.mean_voltages / self.model_voltages, nan=1.0)
 
@@ -84,7 +84,7 @@ def calibrate(electrodes: CompleteElectrodeModel, currents: np.ndarray, matrix: 
         V, F frames; NaN where nothing was measured.
     conductivity : float, optional
         σ in S/m if it is known.
-    correction : "offset" or "gain"
+    correction : "offset", "gain" or "none"
         Treatment of the misfit of the fitted model; see `Calibration`.
     noise : VoltageNoise, optional
         Default: fitted to the scatter of the frames, or of a single frame to the misfit.
@@ -190,10 +190,13 @@ def noise_from_frames(frames: np.ndarray) -> VoltageNoise | None:
     cancel; None for fewer than `MIN_NOISE_FRAMES`."""
     if len(frames) < MIN_NOISE_FRAMES:
         return None
-    values = frames[:, np.isfinite(frames).all(axis=0)]
+    squares = np.diff(frames, n=3, axis=0)**2
+    used = np.isfinite(squares).any(axis=0)
+    if not used.any():
+        return None
     # robust to fast targets: the median of squares, 0.455 of their mean for a normal distribution
-    variance = np.median(np.diff(values, n=3, axis=0)**2, axis=0) / 20 / 0.455
-    return _fit_noise(variance, np.abs(values).mean(axis=0))
+    variance = np.nanmedian(squares[:, used], axis=0) / 20 / 0.455
+    return _fit_noise(variance, np.nanmean(np.abs(frames[:, used]), axis=0))
 
 
 def _fit_noise(variance: np.ndarray, size: np.ndarray) -> VoltageNoise:

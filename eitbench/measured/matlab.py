@@ -13,10 +13,13 @@ from typing import Any
 import numpy as np
 from scipy.io import loadmat
 from scipy.io.matlab import MatReadError
+from scipy.sparse import issparse
 
 from eitbench.measured.measurements import Measurements
 
 MILLIAMPERE = 1e-3
+MATLAB_TYPES = {"O": "cell array or object", "U": "character array"}
+"""Kind of a dtype -> type in MATLAB."""
 KTC_VARIABLES = (("Inj", "Mpat", "Uel"), ("Injref", "Mpat", "Uelref"),
                  ("CurrentPattern", "MeasPattern", "Uel"))
 """Injections, measurement patterns and voltages in files of KTC, its empty tank, and KIT4."""
@@ -43,6 +46,13 @@ def load_variables(path: Path, *required: str) -> dict[str, np.ndarray]:
     if missing := [name for name in required if name not in variables]:
         raise ValueError(f"{path} must hold {', '.join(missing)}, got "
                          f"{', '.join(variables) or 'no variables'}")
+    for name in required:
+        value = variables[name]
+        if issparse(value):
+            variables[name] = value.toarray()
+        elif not (np.issubdtype(value.dtype, np.number) or value.dtype == bool):
+            kind = "struct" if value.dtype.names else MATLAB_TYPES.get(value.dtype.kind, "object")
+            raise ValueError(f"{path}: {name} must be a numeric array, got a {kind}")
     return variables
 
 
@@ -89,9 +99,11 @@ def _ktc_arrays(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return currents, matrix, voltages.reshape(T, M)
 
 
-def read_eidors(path: Path, name: str | None = None) -> Measurements:
+def read_eidors(path: Path, name: str | None = None,
+                reference: str | None = None) -> Measurements:
     """Read the frames (256, F) of the variable ``name``, by default the first known one, such as
-    ``v_rotate`` of iirc_data_2006.mat or ``zc_demo3`` of montreal_data_1995.mat.
+    ``v_rotate`` of iirc_data_2006.mat or ``zc_demo3`` of montreal_data_1995.mat, and homogeneous
+    frames of the variable ``reference``, by default the one that belongs to it.
 
     Row 16·i + j of a frame is the voltage between electrodes j and j + 1 while 1 mA (assumed)
     enters at i and leaves at i + 1, in units of the instrument. The real part of complex values is
@@ -100,8 +112,11 @@ def read_eidors(path: Path, name: str | None = None) -> Measurements:
     """
     variables = load_variables(path)
     if name is None:
-        name = next((each for each in EIDORS_REFERENCES if each in variables), "v_rotate")
-    reference = EIDORS_REFERENCES.get(name)
+        name = next((each for each in EIDORS_REFERENCES if each in variables), None)
+        if name is None:
+            raise ValueError(f"name must be the variable of the frames, such as --option "
+                             f"name=VARIABLE, one of {', '.join(variables) or 'no variables'}")
+    reference = reference or EIDORS_REFERENCES.get(name)
     variables = load_variables(path, name, *filter(None, [reference]))
     frames = _eidors_frames(path, name, variables[name])
     L, F = EIDORS_ELECTRODES, len(frames)

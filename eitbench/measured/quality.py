@@ -5,6 +5,7 @@ from __future__ import annotations
 from itertools import combinations
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 
 from eitbench.measured.calibration import (
     CONTACT_PRIOR_MEAN,
@@ -26,6 +27,46 @@ REORDER_IMPROVEMENT = 0.5
 """Factor by which another order must reduce the misfit to be reported."""
 BAD_ELECTRODE_RATIO = 4.0
 """Misfit of a bad electrode relative to the median."""
+SPIKE_WINDOW = 5
+"""Number of uses of an injection among which a voltage is compared."""
+SPIKE_SIZE, SPIKE_RATIO = 0.2, 10.0
+"""A spike differs from the median of its window by this fraction of the injection's RMS voltage,
+and by this multiple of the range of the other voltages."""
+N_NAMED_SPIKES = 3
+
+
+def find_spikes(measurements: Measurements) -> np.ndarray:
+    """Return (T, M) bool: single voltages far from those of the same channel in the uses of the
+    injection before and after."""
+    spikes = np.zeros(measurements.voltages.shape, dtype=bool)
+    for k in np.unique(measurements.injection_index):
+        uses = np.flatnonzero(measurements.injection_index == k)
+        if len(uses) < SPIKE_WINDOW:
+            continue
+        voltages = np.asarray(measurements.voltages[uses])
+        first = np.clip(np.arange(len(uses)) - SPIKE_WINDOW // 2, 0, len(uses) - SPIKE_WINDOW)
+        windows = sliding_window_view(voltages, SPIKE_WINDOW, axis=0)[first]  # (uses, M, window)
+        typical = np.median(windows, axis=2)                   # NaN where a voltage is missing
+        deviations = np.sort(np.abs(windows - typical[..., None]), axis=2)
+        size = np.sqrt(np.nanmean(np.nanmedian(voltages, axis=0)**2)) if len(voltages) else 0.0
+        with np.errstate(invalid="ignore"):
+            own = np.abs(voltages - typical)
+            spikes[uses] = ((own > SPIKE_SIZE * size) & (own == deviations[..., -1])
+                            & (own > SPIKE_RATIO * deviations[..., -2]))
+    return spikes
+
+
+def spike_warnings(measurements: Measurements, spikes: np.ndarray) -> list[str]:
+    """Return a sentence that names the first spikes."""
+    found = np.argwhere(spikes)
+    if not len(found):
+        return []
+    named = [f"frame {t // measurements.frame_length + 1}, injection "
+             f"{measurements.injection_index[t] + 1}, channel {m + 1} "
+             f"({measurements.voltages[t, m]:.3g} V)" for t, m in found[:N_NAMED_SPIKES]]
+    more = f" and {len(found) - N_NAMED_SPIKES} more" if len(found) > N_NAMED_SPIKES else ""
+    return [f"{len(found)} of {spikes.size} measurements are spikes and are left out: "
+            f"{'; '.join(named)}{more}."]
 
 
 def quality_warnings(measurements: Measurements, calibration: Calibration,
@@ -90,7 +131,8 @@ def _order_warnings(measurements: Measurements, calibration: Calibration,
         currents = measurements.currents[:, injecting]
         matrix = measurements.matrix[:, measuring]
         passive = finite & (np.abs(currents) @ np.abs(matrix).T == 0.0)
-        used = passive if passive.any() else finite
+        # where all electrodes inject, only channels near zero remain, whose misfit says little
+        used = passive if 2 * passive.sum() > finite.sum() else finite
         y, x = calibration.mean_voltages[used], (currents @ R @ matrix.T)[used]
         return float(np.linalg.norm(y - (x @ y) / (x @ x) * x) / np.linalg.norm(y))
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import re
 from collections.abc import Callable
 from dataclasses import replace
 from datetime import datetime
@@ -17,9 +18,16 @@ from eitbench._extras import needed_by
 from eitbench.measured.matlab import load_variables, provenance, read_eidors, read_ktc
 from eitbench.measured.measurements import Measurements
 
-AMPLITUDE, FREQUENCY, TIME, CHANNELS = 8, 4, 3, "MeasurementChannels:"
-"""Header lines of Sciospec files, from 0: peak current in A, frequency in Hz, time of the frame."""
-TIMESTAMP_FORMAT = "%Y.%m.%d. %H:%M:%S.%f"
+TIME, LOWEST, HIGHEST, COUNT, AMPLITUDE, MODE = 3, 4, 5, 7, 8, 13
+"""Header lines of Sciospec files, from 0: time of the frame, lowest and highest frequency in Hz,
+number of frequencies, peak current in A, measurement mode."""
+CHANNELS = "MeasurementChannels:"
+TIMESTAMP_FORMATS = ("%Y.%m.%d. %H:%M:%S.%f", "%Y.%m.%d. %H:%M:%S")
+SINGLE_ENDED, DIFFERENTIAL = "1", "2"
+"""Measurement modes: potentials to ground, or differences of neighbouring channels."""
+TABLE_VOLTAGES = ("potentials", "neighbours")
+DIFFERENCE_TITLE = re.compile(r".*\d\s*[-–]\s*\D*\d+\s*")
+"""Title of a column such as ``U1-U2``."""
 
 
 def read(path: Path | str, format: str | None = None, steps: slice | None = None,
@@ -37,8 +45,12 @@ def read(path: Path | str, format: str | None = None, steps: slice | None = None
     format = format or _detect_format(path)
     if format not in READERS:
         raise ValueError(f"format must be one of {', '.join(READERS)}, got {format!r}")
-    if format == "table" and not options:
-        options = _table_options(path.with_suffix(".yml"))
+    if format == "table" and "electrodes" not in options:
+        options = _table_options(path) | options
+    names = set(signature(READERS[format]).parameters) - {"path", "steps"}
+    if unknown := sorted(set(options) - names):
+        raise ValueError(f"options of a file of format {format} must be among "
+                         f"{', '.join(sorted(names)) or '(none)'}, got {', '.join(unknown)}")
     try:
         if format == "hdf5" and steps is not None:
             return Measurements.load(path, steps).select(slice(None))
@@ -64,34 +76,43 @@ def _detect_format(path: Path) -> str:
                      f"one of {', '.join(READERS)}")
 
 
-def read_sciospec(path: Path) -> Measurements:
+def read_sciospec(path: Path, *, frequency: float | None = None) -> Measurements:
     """Read one ``.eit`` file, or all files of a folder in the order of their names.
 
-    The voltages are the real parts of the potentials relative to the mean of all electrodes. The
-    current enters at the first electrode of a pair with the header's amplitude in A. The
-    injections of a frame are evenly spaced until the next frame.
+    The voltages are the real parts of the potentials relative to the mean of all electrodes, or of
+    the differences of neighbouring channels, as the header's measurement mode tells. The current
+    enters at the first electrode of a pair with the header's amplitude in A. The injections of a
+    frame are evenly spaced until the next frame. A file of several frequencies needs
+    ``frequency`` in Hz, the one to read.
     """
     files = sorted(path.glob("*.eit")) if path.is_dir() else [path]
     if not files:
         raise ValueError(f"{path} must hold .eit files, got none")
-    starts, settings, frames = zip(*map(_read_frame, files), strict=True)
+    starts, settings, frames = zip(*(_read_frame(file, frequency) for file in files), strict=True)
     for file, setting in zip(files, settings, strict=True):
         if setting != settings[0]:
-            raise ValueError(f"{file} must have the injections of {files[0]}")
-    frequency, amplitude, pairs = settings[0]
-    potentials = np.array(frames)
-    _, K, L = potentials.shape
-    potentials -= potentials.mean(axis=2, keepdims=True)
+            raise ValueError(f"{file} must have the injections, frequency and measurement mode of "
+                             f"{files[0]}")
+    hertz, amplitude, is_differential, pairs = settings[0]
+    voltages = np.array(frames)
+    _, K, L = voltages.shape
+    matrix = np.eye(L)
+    if is_differential:
+        matrix -= np.roll(matrix, 1, axis=1)
+    else:
+        voltages -= voltages.mean(axis=2, keepdims=True)
     frame_time = float(np.median(np.diff(starts))) if len(files) > 1 else 1.0
     times = np.subtract(starts, starts[0])[:, None] + frame_time / K * np.arange(K)
     digest = hashlib.sha256(b"".join(file.read_bytes() for file in files)).hexdigest()
     # every folder of frames is called setup; its parent's name identifies it
     name = f"{path.resolve().parent.name}/{path.name}" if path.is_dir() else path.name
+    kind = ("differences of neighbours" if is_differential
+            else "relative to the mean of all electrodes")
     return Measurements(
         _pair_currents(np.array(pairs), amplitude, L), np.tile(np.arange(K), len(files)),
-        np.eye(L), potentials.reshape(-1, L), times.ravel(),
-        source={"file": name, "sha256": digest, "frames": len(files), "frequency": frequency,
-                "assumed": "real parts, relative to the mean of all electrodes; amplitude in A"})
+        matrix, voltages.reshape(-1, L), times.ravel(),
+        source={"file": name, "sha256": digest, "frames": len(files), "frequency": hertz,
+                "assumed": f"real parts, {kind}; amplitude in A"})
 
 
 def _pair_currents(pairs: np.ndarray, current: float, L: int) -> np.ndarray:
@@ -103,41 +124,69 @@ def _pair_currents(pairs: np.ndarray, current: float, L: int) -> np.ndarray:
     return currents
 
 
-def _read_frame(path: Path) -> tuple[float, tuple[float, float, list[list[int]]], np.ndarray]:
-    """Return the time in s; frequency in Hz, amplitude in A and electrode pairs; real parts (K, L)
-    in V."""
+def _read_frame(path: Path, frequency: float | None) -> tuple[
+        float, tuple[float, float, bool, list[list[int]]], np.ndarray]:
+    """Return the time in s; frequency in Hz, amplitude in A, whether the channels are differences,
+    and electrode pairs; real parts (K, L) in V."""
     try:
         lines = path.read_text(encoding="utf-8").splitlines()
         header = int(lines[0])
-        time = datetime.strptime(lines[TIME].strip(), TIMESTAMP_FORMAT).timestamp()
-        frequency, amplitude = float(lines[FREQUENCY]), float(lines[AMPLITUDE])
+        time = _timestamp(lines[TIME].strip())
+        low, high, amplitude = (float(lines[at]) for at in (LOWEST, HIGHEST, AMPLITUDE))
+        n_frequencies, mode = int(lines[COUNT]), lines[MODE].strip()
         channels = next(line for line in lines[:header] if line.startswith(CHANNELS))
         count = len(channels.removeprefix(CHANNELS).split(","))
     except (OSError, UnicodeDecodeError, ValueError, IndexError, StopIteration):
         raise ValueError(f"{path} must begin with the header of a .eit file") from None
+    if mode not in (SINGLE_ENDED, DIFFERENTIAL):
+        raise ValueError(f"{path} must have the measurement mode {SINGLE_ENDED} (single-ended) or "
+                         f"{DIFFERENTIAL} (differential), got {mode}")
+    index = _frequency_index(path, low, high, n_frequencies, frequency)
     body = [line.split() for line in lines[header:]]
     try:
-        pairs = np.array(body[::2], dtype=int)
-        parts = np.array(body[1::2], dtype=float)
+        pairs = np.array(body[::1 + n_frequencies], dtype=int)
+        parts = np.array(body[1 + index::1 + n_frequencies], dtype=float)
         is_valid = (pairs.shape == (len(parts), 2) and parts.shape[1] >= 2 * count
+                    and len(body) == len(pairs) * (1 + n_frequencies)
                     and pairs.min() >= 1 and pairs.max() <= count)
     except (ValueError, IndexError):                    # lines of different lengths, text, or none
         is_valid = False
     if not is_valid:
-        raise ValueError(f"{path} must hold pairs of lines after its header: two electrodes from 1 "
-                         f"to {count}, and {2 * count} numbers with decimal points, two for each "
-                         "channel")
-    return time, (frequency, amplitude, pairs.tolist()), parts[:, :2 * count:2]
+        raise ValueError(f"{path} must hold blocks of lines after its header: two electrodes from "
+                         f"1 to {count}, and for each frequency ({n_frequencies}) {2 * count} "
+                         "numbers with decimal points, two for each channel")
+    hertz = low if frequency is None else frequency
+    return (time, (hertz, amplitude, mode == DIFFERENTIAL, pairs.tolist()),
+            parts[:, :2 * count:2])
+
+
+def _timestamp(text: str) -> float:
+    """Parse a time; a whole second has no fraction."""
+    try:
+        return datetime.strptime(text, TIMESTAMP_FORMATS[0]).timestamp()
+    except ValueError:
+        return datetime.strptime(text, TIMESTAMP_FORMATS[1]).timestamp()
+
+
+def _frequency_index(path: Path, low: float, high: float, count: int,
+                     frequency: float | None) -> int:
+    """Return the position of the chosen frequency: the lowest or the highest, since the header
+    does not list those between."""
+    if count == 1 and frequency in (None, low):
+        return 0
+    if frequency in (low, high) and count > 1:
+        return 0 if frequency == low else count - 1
+    raise ValueError(f"{path} holds {count} frequencies from {low:g} to {high:g} Hz: frequency "
+                     f"must be {low:g} or {high:g}, got {frequency}")
 
 
 def read_table(path: Path, *, electrodes: int, current: float, time_step: float = 1.0,
                unit: float = 1.0, decimal: str = ".", separator: str | None = None,
-               reference_rows: int = 0) -> Measurements:
+               reference_rows: int = 0, readings: str | None = None) -> Measurements:
     """Read a text table with one row per injection.
 
     Columns are the electrode (from 1) at which ``current`` enters, the electrode at which it
-    leaves, and one voltage per electrode: its potential, or, if a column title has a ``-``, its
-    difference from the next electrode. A first line that does not begin with a number holds the
+    leaves, and one voltage per electrode. A first line that does not begin with a number holds the
     titles. Empty fields are NaN.
 
     Parameters
@@ -155,15 +204,23 @@ def read_table(path: Path, *, electrodes: int, current: float, time_step: float 
         Default: a tab, a semicolon, or else a comma.
     reference_rows : int
         Number of first rows that become the reference: complete frames of homogeneous fluid.
+    readings : "potentials" or "neighbours", optional
+        Whether a voltage is the potential of its electrode, or its difference from the next
+        electrode. Default: differences if all their titles are such as ``U1-U2``.
     """
+    if readings not in (None, *TABLE_VOLTAGES):
+        raise ValueError(f"readings must be one of {', '.join(TABLE_VOLTAGES)}, got {readings!r}")
     L = _check.integer("electrodes", electrodes, low=2)
     _check.number("current", current, low=0.0, open_low=True, units="A")
     _check.number("time_step", time_step, low=0.0, open_low=True, units="s")
     R = _check.integer("reference_rows", reference_rows, low=0)
-    pairs, voltages, are_differences = _read_rows(path, L, decimal, separator)
+    pairs, voltages, titles = _read_rows(path, L, decimal, separator)
+    if readings is None:
+        named = titles and all(map(DIFFERENCE_TITLE.fullmatch, titles))
+        readings = "neighbours" if named else "potentials"
     voltages *= unit
     matrix = np.eye(L)
-    if are_differences:
+    if readings == "neighbours":
         matrix -= np.roll(matrix, 1, axis=1)
     else:
         finite = np.isfinite(voltages)
@@ -184,8 +241,8 @@ def read_table(path: Path, *, electrodes: int, current: float, time_step: float 
 
 
 def _read_rows(path: Path, L: int, decimal: str,
-               separator: str | None) -> tuple[np.ndarray, np.ndarray, bool]:
-    """Return electrode pairs (T, 2) from 1, voltages (T, L), and whether they are differences."""
+               separator: str | None) -> tuple[np.ndarray, np.ndarray, list[str]]:
+    """Return electrode pairs (T, 2) from 1, voltages (T, L), and the titles of the voltages."""
     if decimal not in (".", ","):
         raise ValueError(f"decimal must be '.' or ',', got {decimal!r}")
     try:
@@ -195,11 +252,13 @@ def _read_rows(path: Path, L: int, decimal: str,
         if separator == decimal:
             raise ValueError(f"separator must differ from the decimal point, got {separator!r} for "
                              "both")
-        titles = "" if not lines or lines[0].split(separator)[0].strip().isdigit() else lines[0]
-        if len(lines) <= bool(titles):
+        titles: list[str] = []
+        if lines and not _is_number(first := lines[0].split(separator)[0], decimal):
+            titles = lines.pop(0).split(separator)[2:] or [first]
+        if not lines:
             raise ValueError("it must hold rows, got none")
         numbers = np.loadtxt(
-            lines, delimiter=separator, comments=None, skiprows=int(bool(titles)), ndmin=2,
+            lines, delimiter=separator, comments=None, ndmin=2,
             converters=lambda text: float(text.strip().replace(decimal, ".") or "nan"))
         if numbers.shape[1] != L + 2:
             raise ValueError(f"rows must have {L + 2} columns, two electrodes and {L} voltages, "
@@ -213,13 +272,25 @@ def _read_rows(path: Path, L: int, decimal: str,
         row = int(valid.argmin())
         raise ValueError(f"{path}: row {row + 1} must begin with two electrodes from 1 to {L}, got "
                          f"{ends[row, 0]:g} and {ends[row, 1]:g}")
-    return ends.astype(int), numbers[:, 2:], "-" in titles
+    return ends.astype(int), numbers[:, 2:], titles
 
 
-def _table_options(path: Path) -> dict[str, Any]:
-    if not path.is_file():
+def _is_number(text: str, decimal: str) -> bool:
+    try:
+        float(text.strip().replace(decimal, "."))
+    except ValueError:
+        return False
+    return True
+
+
+def _table_options(table: Path) -> dict[str, Any]:
+    """Load the description ``TABLE.csv.yml`` or ``TABLE.yml``; the latter may be a vessel's."""
+    path = next((each for each in (table.with_name(table.name + ".yml"), table.with_suffix(".yml"))
+                 if each.is_file() and "kind" not in load_yaml(each, "table")), None)
+    if path is None:
         raise ValueError("a table must be described by a YAML file of entries like 'electrodes: "
-                         f"16' and 'current: 0.001' (A), got no {path}")
+                         f"16' and 'current: 0.001' (A), got no {table.name}.yml and no "
+                         f"{table.stem}.yml of a table beside {table}")
     options = load_yaml(path, "table")
     names = set(signature(read_table).parameters) - {"path"}
     if not set(options) <= names:

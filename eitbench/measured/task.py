@@ -17,7 +17,7 @@ from eitbench.estimation.nodal import modal_states
 from eitbench.estimation.walk import RandomWalk, matern32_transition, matern_modes
 from eitbench.measured.calibration import Calibration
 from eitbench.measured.measurements import Measurements
-from eitbench.measured.model import MeasurementModel, complete_channels, visible_measurement
+from eitbench.measured.model import MeasurementModel, available_channels, visible_measurement
 from eitbench.measured.vessel import VesselConfig
 from eitbench.physics.observation import LinearConductivity, ObservationModel
 from eitbench.physics.profiles import parabolic_model
@@ -83,7 +83,7 @@ def task_from_measurements(vessel: VesselConfig, calibration: Calibration,
                          LinearConductivity(molar_conductivity), 1e-3 * background),
         measurements.currents, calibration.gain * measurements.matrix, vessel.depth,
         offset=calibration.offset, gain=calibration.channel_gain,
-        mask=complete_channels(measurements) if mask is None else mask)
+        mask=available_channels(measurements) if mask is None else mask)
     T, frame = len(measurements.injection_index), measurements.frame_length
     step = float(np.median(np.diff(measurements.times))) if T > 1 else 1.0
     noise = calibration.noise
@@ -198,7 +198,7 @@ class _NegTwoLogEvidence:
         self._data = []
         for voltages, currents in (visible_measurement(model, measurements, t) for t in used):
             H, value, variance, _ = linear(voltages, currents)
-            visible = H.any(axis=1)
+            visible = H.any(axis=1) & np.isfinite(value)
             self._data.append((H[visible] @ modes, (value - H @ point)[visible],
                                variance[visible]))
 

@@ -32,7 +32,8 @@ CLASS_COLOURS = ListedColormap(["#f4f4f2", "#d1495b", "#0b6e75"])
 """Water, resistive, conductive."""
 LINE_COLOURS = ("#0b6e75", "#d1495b", "#b8860b", "#7a5195", "#5b6770")
 CORRECTION_TEXT = {"offset": "The misfit is subtracted from all readings.",
-                   "gain": "Each reading is divided by its ratio to the model."}
+                   "gain": "Each reading is divided by its ratio to the model.",
+                   "none": "Nothing is corrected: the image is absolute."}
 MIN_PLOTTED = 1e-2
 """Lower end of the axes of residuals and NIS, which are 0 in a homogeneous first frame."""
 LOG_SCALE_RATIO = 5.0

@@ -14,10 +14,11 @@ from eitbench.envs.measured import MeasuredEnv
 from eitbench.estimation.walk import RandomWalk
 from eitbench.measured import Measurements
 from eitbench.measured.model import MeasurementModel
+from eitbench.measured.quality import find_spikes
 from eitbench.numerics.fem import mass_matrix
 from eitbench.physics.stationary import StationaryTransport
 from gymnasium.utils.env_checker import check_env
-from tanks import FIXED_STDS, PIPE, VESSEL, simulate_measurements, stationary
+from tanks import FIXED_STDS, PIPE, VESSEL, centroid, simulate_measurements, stationary
 
 import short
 
@@ -196,3 +197,48 @@ def test_a_pipe_with_a_flow_has_the_transport_of_the_world():
     c = 30.0 + np.random.default_rng(1).normal(size=transport.mesh.n_nodes)
     np.testing.assert_allclose(transport.step(c, 30.0, 31.0), expected.step(c, 30.0, 31.0), rtol=1e-10)
     assert task.velocity is None
+
+
+def located(measurements, **options):
+    """Return environment, run and centroid of the inclusion at the end."""
+    env = MeasuredEnv(measurements, VESSEL, **FIXED_STDS | options)
+    run = run_on_measurements(env, "log_walk_filter")
+    return env, run, centroid(env.task.mesh.points, run.mean[-1])
+
+
+def test_lost_measurements_are_left_out_one_by_one(measurements):
+    """With 5 % lost all channels are used, and the inclusion is found within 5 mm of the complete data's."""
+    _, complete, position = located(measurements)
+    lost = np.random.default_rng(0).random(measurements.voltages.shape) < 0.05
+    env, run, found = located(replace(measurements, voltages=np.where(lost, np.nan, measurements.voltages)))
+    assert env.available.all()
+    assert np.linalg.norm(found - position) < 5e-3
+    assert run.withheld_rmse == pytest.approx(complete.withheld_rmse, rel=0.2)
+
+
+@pytest.mark.parametrize("frame", [0, 3])
+def test_a_spike_is_named_and_left_out(measurements, frame):
+    """A voltage ten times too large changes neither the estimate nor the score by a fifth."""
+    _, clean, position = located(measurements)
+    voltages = measurements.voltages.copy()
+    voltages[8 * frame + 3, 6] *= 10
+    env, run, found = located(replace(measurements, voltages=voltages))
+    assert f"frame {frame + 1}, injection 4, channel 7" in env.quality_warnings()[0]
+    assert np.linalg.norm(found - position) < 5e-3
+    assert run.withheld_rmse == pytest.approx(clean.withheld_rmse, rel=0.2)
+
+
+def test_moving_targets_have_no_spikes(measurements):
+    assert not find_spikes(measurements).any()
+
+
+def test_a_frame_is_not_scored_by_itself():
+    """Without a homogeneous frame nothing is scored; an absolute image shows the inclusion."""
+    single = replace(stationary(), reference=None)
+    env = MeasuredEnv(single, VESSEL, initial_std=0.2)
+    assert "no homogeneous frame" in env.quality_warnings()[0]
+    assert np.isnan(run_on_measurements(env, "gauss_newton").withheld_rmse)
+    env = MeasuredEnv(single, VESSEL, initial_std=0.2, correction="none")
+    run = run_on_measurements(env, "gauss_newton")
+    assert np.isfinite(run.withheld_rmse)
+    assert np.linalg.norm(centroid(env.task.mesh.points, run.mean[-1]) - [0.05, 0.0]) < 0.01

@@ -5,6 +5,7 @@ import pytest
 from eitbench.measured import read
 from eitbench.measured.cases import read_case
 from scipy.io import savemat
+from scipy.sparse import csc_array
 from tanks import instrument
 
 CURRENTS, MATRIX = instrument()
@@ -79,10 +80,10 @@ def test_truncated_frame_is_named(tmp_path):
     eit_file(path, np.ones((8, 8)))
     lines = path.read_text(encoding="utf-8").splitlines()
     path.write_text("\n".join(lines[:-1]), encoding="utf-8")
-    with pytest.raises(ValueError, match=r"setup_00001\.eit must hold pairs of lines"):
+    with pytest.raises(ValueError, match=r"setup_00001\.eit must hold blocks of lines"):
         read(path)
     path.write_text("\n".join([*lines[:-1], lines[-1][:40]]), encoding="utf-8")
-    with pytest.raises(ValueError, match=r"must hold pairs of lines"):
+    with pytest.raises(ValueError, match=r"must hold blocks of lines"):
         read(path)
     path.write_text("", encoding="utf-8")
     with pytest.raises(ValueError, match="must begin with the header"):
@@ -153,3 +154,91 @@ def test_real_files(case, shape):
     except ValueError as error:
         pytest.skip(str(error))
     assert measurements.voltages.shape == shape
+
+
+def described_table(path, titles="", readings=None, first="{:d}"):
+    """Write a table of two rows with its description."""
+    rows = [f"{first.format(k + 1)},{first.format(k + 2)}," + ",".join(f"{each:.6g}" for each in row)
+            for k, row in enumerate(VALUES[:2])]
+    path.write_text("\n".join([*[titles] * bool(titles), *rows]) + "\n")
+    extra = f"readings: {readings}\n" if readings else ""
+    path.with_suffix(".yml").write_text(f"electrodes: 8\ncurrent: 0.001\n{extra}")
+    return read(path)
+
+
+@pytest.mark.parametrize(("titles", "first"), [
+    ("", "{:d}.0"), ("", "{:d}.000e+00"), ("source,sink," + ",".join(f"ch-{k}" for k in range(1, 9)), "{:d}"),
+    ("I+,I-," + ",".join(f"U{k}" for k in range(1, 9)), "{:d}")])
+def test_tables_of_potentials(tmp_path, titles, first):
+    """Numbers with a decimal point are no titles, and a "-" in a title is no difference."""
+    plain = described_table(tmp_path / "plain.csv")
+    other = described_table(tmp_path / "other.csv", titles, first=first)
+    np.testing.assert_array_equal(other.voltages, plain.voltages)
+    np.testing.assert_array_equal(other.matrix, np.eye(8))
+    np.testing.assert_array_equal(other.currents, plain.currents)
+
+
+def test_tables_of_differences(tmp_path):
+    """Titles that name two electrodes, or the description, tell that the voltages are differences."""
+    titles = "a,b," + ",".join(f"U{k + 1}-U{(k + 1) % 8 + 1}" for k in range(8))
+    for each in (described_table(tmp_path / "a.csv", titles),
+                 described_table(tmp_path / "b.csv", readings="neighbours")):
+        np.testing.assert_array_equal(each.matrix, MATRIX)
+    np.testing.assert_array_equal(described_table(tmp_path / "c.csv", titles, "potentials").matrix, np.eye(8))
+    with pytest.raises(ValueError, match="readings must be one of potentials, neighbours, got 'volts'"):
+        described_table(tmp_path / "d.csv", readings="volts")
+
+
+def test_file_of_a_vessel_does_not_describe_a_table(tmp_path):
+    described_table(tmp_path / "tank.csv")
+    (tmp_path / "tank.yml").rename(tmp_path / "tank.csv.yml")
+    (tmp_path / "tank.yml").write_text("kind: circle\nradius: 0.1\n")
+    assert read(tmp_path / "tank.csv").voltages.shape == (2, 8)
+    (tmp_path / "tank.csv.yml").unlink()
+    with pytest.raises(ValueError, match=r"no tank\.csv\.yml"):
+        read(tmp_path / "tank.csv")
+
+
+def test_sciospec_header_is_heeded(tmp_path):
+    """Whole seconds, the differential mode and several frequencies."""
+    file = tmp_path / "setup_00001.eit"
+    eit_file(file, VALUES + 0j)
+    lines = file.read_text().splitlines()
+    lines[3] = "2025.02.12. 13:19:00"
+    lines[13] = "2"
+    file.write_text("\n".join(lines))
+    differential = read(file)
+    np.testing.assert_array_equal(differential.matrix, MATRIX)
+    np.testing.assert_array_equal(differential.voltages, VALUES)
+    lines[4:8] = ["1000.0", "5000.0", "0", "2"]
+    body = [line for pair, numbers in zip(lines[18::2], lines[19::2], strict=True)
+            for line in (pair, numbers, "\t".join(str(2 * float(each)) for each in numbers.split()))]
+    file.write_text("\n".join(lines[:18] + body))
+    np.testing.assert_allclose(read(file, frequency=5000).voltages, 2 * VALUES)
+    np.testing.assert_array_equal(read(file, frequency=1000).voltages, VALUES)
+    with pytest.raises(ValueError, match="from 1000 to 5000 Hz: frequency must be 1000 or 5000, got None"):
+        read(file)
+    lines[13] = "7"
+    file.write_text("\n".join(lines))
+    with pytest.raises(ValueError, match="measurement mode 1"):
+        read(file)
+
+
+def test_variables_of_matlab_files(tmp_path):
+    """Names of an EIDORS file's variables; sparse arrays; types that hold no numbers."""
+    frames = np.random.default_rng(1).uniform(1, 2, (256, 3))
+    savemat(tmp_path / "a.mat", {"mine": frames, "water": frames[:, :1], "text": "abc",
+                                 "cell": np.array([1, "a"], object)})
+    measurements = read(tmp_path / "a.mat", name="mine", reference="water")
+    assert measurements.voltages.shape == (48, 16)
+    assert measurements.reference.shape == (1, 16, 16)
+    with pytest.raises(ValueError, match="one of mine, water"):
+        read(tmp_path / "a.mat")
+    for name, kind in (("text", "character array"), ("cell", "cell array")):
+        with pytest.raises(ValueError, match=f"{name} must be a numeric array, got a {kind}"):
+            read(tmp_path / "a.mat", name=name)
+    with pytest.raises(ValueError, match="must be among name, reference, got colour"):
+        read(tmp_path / "a.mat", colour=1)
+    patterns = {"Inj": csc_array(1e3 * CURRENTS.T), "Mpat": csc_array(MATRIX.T)}
+    savemat(tmp_path / "data1.mat", patterns | {"Uel": VALUES.reshape(-1, 1)})
+    np.testing.assert_allclose(read(tmp_path / "data1.mat").currents, CURRENTS, atol=1e-15)
