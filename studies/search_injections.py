@@ -59,7 +59,7 @@ class Search:
                 action = (np.array(chosen, np.float32) if isinstance(chosen, tuple)
                           else rules.action(chosen))
                 observation, reward, *_ = env.step(np.array([action] * env.num_envs))
-                injected += injects
+                injected += now
                 total += reward.mean()
                 self.steps += env.num_envs
             self.rewards[key] = total / (world.n_steps - world.warm_up)
