@@ -16,7 +16,7 @@ from eitbench.bench.records import read_records
 from eitbench.bench.run import Job, run_episode
 from eitbench.bench.text import mean_and_interval, rounded, scores_by_seed, seed_ranges
 from eitbench.bench.tracks import Environment
-from eitbench.bench.verify import job_of
+from eitbench.bench.verify import job_for_record
 from eitbench.data.seeds import parse_seeds
 
 PLAYED = {"Pipe2DInjection": ("best_pair", "random_pair"),
@@ -35,7 +35,7 @@ def main() -> None:
         for policy in policies:
             record = records[f"eitbench-{world}-v0", policy]
             exact = scores_by_seed(record, "error")
-            full = job_of(record, isolate="none")
+            full = job_for_record(record, isolate="none")
             reduced = Environment(full.environment.id, json.dumps({"estimator": "reduced"}))
             steps = [exact[seed]
                      - run_episode(Job(reduced, full.method,

@@ -14,7 +14,7 @@ from tqdm import tqdm
 
 from eitbench import scoring
 from eitbench.bench.methods import load_method
-from eitbench.bench.playing import estimates
+from eitbench.bench.runner import iter_estimates
 from eitbench.data.recordings import score_operators
 from eitbench.envs.estimation import EstimationEnv
 from eitbench.envs.rendering import SPREAD_MAP, colour_range, draw_electrodes, draw_field
@@ -28,7 +28,7 @@ INK, TRUE, ACCENT = "#0b6e75", "0.35", "#d1495b"
 
 def estimates_of(env: EstimationEnv, baseline: str, seed: int) -> list[Estimate]:
     """What a baseline says of t = 1 … T."""
-    steps = estimates(env, load_method(baseline, "estimation"), seed)
+    steps = iter_estimates(env, load_method(baseline, "estimation"), seed)
     with threadpool_limits(1):
         return [estimate for _, estimate in tqdm(steps, total=env.task.n_steps, desc=baseline,
                                                  unit="state", disable=None, leave=False)]

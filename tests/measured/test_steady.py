@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from eitbench.bench.playing import run_on_measurements
+from eitbench.bench.runner import run_on_measurements
 from eitbench.envs.measured import MeasuredEnv
 from eitbench.estimation.walk import smooth_modes, steady
 from tanks import BELIEVED, VESSEL, moving
