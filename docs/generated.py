@@ -8,7 +8,7 @@ import re
 from pathlib import Path
 
 import eitbench
-from eitbench.bench.methods import load_method, own_methods
+from eitbench.bench.methods import builtin_methods, load_method
 from eitbench.bench.text import with_interval
 from eitbench.bench.tracks import own_ids
 
@@ -85,7 +85,7 @@ def baselines() -> Files:
     lists = []
     for track, heading in (("estimation", "Estimators"), ("injection", "Injection policies")):
         lines = []
-        for name in own_methods(track):
+        for name in builtin_methods(track):
             method = load_method(name, track)
             source = method.path.read_text(encoding="utf-8")
             docstring, code = re.fullmatch(r'"""(.*?)"""\n+(.*)', source, re.DOTALL).groups()

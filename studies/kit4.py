@@ -17,7 +17,7 @@ from matplotlib.figure import Figure
 from scipy.ndimage import center_of_mass, label
 from thesis.common import despine, save_figure
 
-from eitbench.bench.playing import run_on_measurements
+from eitbench.bench.runner import run_on_measurements
 from eitbench.envs.measured import MeasuredEnv, case_env
 
 ROOT = Path(__file__).parents[1]

@@ -16,7 +16,7 @@ from eitbench.bench.records import read_records
 from eitbench.bench.run import Job, run_episode
 from eitbench.bench.text import mean_and_interval, rounded, scores_by_seed, seed_ranges
 from eitbench.bench.tracks import Environment
-from eitbench.bench.verify import job_of
+from eitbench.bench.verify import job_for_record
 from eitbench.data.seeds import parse_seeds
 
 POLICIES = {"Pipe2DInjection": ("best_pair", "random_pair"),
@@ -35,7 +35,7 @@ def main() -> None:
         for policy in policies:
             record = records[f"eitbench-{world}-v0", policy]
             full_errors = scores_by_seed(record, "error")
-            job = job_of(record, isolate="none")
+            job = job_for_record(record, isolate="none")
             reduced = Environment(job.environment.id, json.dumps({"estimator": "reduced"}))
             differences = [
                 full_errors[seed] - run_episode(Job(reduced, job.method, parse_seeds(seed)[0])

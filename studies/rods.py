@@ -18,7 +18,7 @@ from matplotlib.patches import Circle
 from scipy.optimize import least_squares
 from thesis.common import despine, save_figure
 
-from eitbench.bench.playing import run_on_measurements
+from eitbench.bench.runner import run_on_measurements
 from eitbench.envs.measured import MeasuredEnv
 from eitbench.measured import read
 from eitbench.measured.cases import read_case

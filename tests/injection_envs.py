@@ -4,7 +4,7 @@ import json
 
 import gymnasium as gym
 import numpy as np
-from eitbench.bench import playing
+from eitbench.bench import runner
 from eitbench.bench.methods import load_method
 from eitbench.bench.scores import Outcome
 from eitbench.bench.tracks import Environment
@@ -65,4 +65,4 @@ def arrays_of(observation) -> list[np.ndarray]:
 def injected(name: str, kwargs: dict, policy: str, seed: int, estimator: str = "full") -> Outcome:
     """What can be scored of an episode that a policy plays, with this filter inside."""
     asked = Environment(name, json.dumps(kwargs | {"estimator": estimator}))
-    return playing.play(asked, load_method(policy, "injection"), seed).outcome
+    return runner.run_method(asked, load_method(policy, "injection"), seed).outcome

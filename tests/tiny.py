@@ -5,7 +5,7 @@ import json
 from pathlib import Path
 
 from eitbench.bench import store
-from eitbench.bench.records import SCHEMA, sealed, split_of
+from eitbench.bench.records import SCHEMA, split_of, with_content_hash
 from eitbench.bench.tracks import Environment
 
 SCENARIO = {"flow": {"mean_velocity": 45.0}, "schedule": {"scored_steps": 3, "pattern": {"frame": 2}},
@@ -110,7 +110,7 @@ def record(method: str, errors: dict[str, float | None] | list[float | None], *,
     errors = errors if isinstance(errors, dict) else {f"test:{i}": error for i, error in enumerate(errors)}
     episodes = [episode(seed, error, **(scores or {})) | {"finished": f"{finished}T00:00:00+00:00"}
                 for seed, error in errors.items()]
-    return sealed({
+    return with_content_hash({
         "schema": SCHEMA, "environment": {"id": id, "name": id.replace("/", "-"), "kwargs": {}}, "board": board,
         "method": method, "title": method.replace("_", " ").capitalize(), "parameters": {}, "role": None,
         "privileged": False, "official": False, "method_sha256": sha(method + version), "checkpoint_sha256": None,

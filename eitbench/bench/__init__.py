@@ -45,12 +45,12 @@ def load(folder: Path | str | None = None, *, measured: bool = False) -> pd.Data
         import pandas as pd
 
         from eitbench._files import shipped
-        from eitbench.bench.records import newest, read_records, read_sound_files
+        from eitbench.bench.records import read_records, read_valid_files, split_outdated
     path = Path(folder or shipped("leaderboards") / "results")
     records = read_records(path, keep=_without_steps)
     if measured:
-        records += read_sound_files(path, measured=True)[0].values()
-    groups = newest(records)
+        records += read_valid_files(path, measured=True)[0].values()
+    groups = split_outdated(records)
     rows = [row for group, outdated in zip(groups, (False, True), strict=True)
             for record in group for row in _rows(record, outdated)]
     types = dict.fromkeys(("privileged", "official", "outdated"), bool) | {"value": float}

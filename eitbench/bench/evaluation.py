@@ -12,9 +12,9 @@ import pandas as pd
 from tqdm import tqdm
 
 from eitbench import _check
-from eitbench.bench.methods import FORMS, Method, load_method, method_of
-from eitbench.bench.playing import play
+from eitbench.bench.methods import METHOD_KINDS, Method, load_method, method_from_class
 from eitbench.bench.run import Job
+from eitbench.bench.runner import run_method
 from eitbench.bench.scores import scored
 from eitbench.bench.suites import isolated_job
 from eitbench.bench.tracks import Environment
@@ -72,7 +72,7 @@ def _method(runner: Method | Job) -> Method:
 def _row(asked: Environment, runner: Method | Job, seed: int) -> dict[str, Any]:
     method = _method(runner)
     try:
-        outcome = play(asked, method, seed).outcome
+        outcome = run_method(asked, method, seed).outcome
     except Exception as error:
         error.add_note(f"{method.name} on {asked.id}, {format_seed(seed)}")
         raise
@@ -96,7 +96,7 @@ def method_given(given: Any, track: str) -> Method:
     if isinstance(given, str | Path):
         return load_method(str(given), track)
     if not isinstance(given, type):
-        form = FORMS[track]
-        raise ValueError(f"method must be a class with {form.answers}, or the name or file of a "
+        form = METHOD_KINDS[track]
+        raise ValueError(f"method must be a class with {form.interface}, or the name or file of a "
                          f"{form.kind}, got {type(given).__name__}")
-    return method_of(given, track, given.__name__)
+    return method_from_class(given, track, given.__name__)

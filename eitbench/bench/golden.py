@@ -20,15 +20,15 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from eitbench._files import PACKAGE, write_atomically
-from eitbench.bench import playing, tracks
+from eitbench.bench import runner, tracks
 from eitbench.bench.methods import (
     baseline_folder,
-    card_name,
-    card_version,
+    builtin_agents,
+    builtin_methods,
+    golden_name,
+    golden_version,
     is_path,
     load_method,
-    own_agents,
-    own_methods,
 )
 from eitbench.bench.scores import scored, scores
 from eitbench.data.episode_cache import (
@@ -54,25 +54,25 @@ FIRST_STEPS = 24
 WORLD_EPISODES = {"train:0": FIRST_STEPS, "dev:0": None}
 """Seed -> number of simulated steps of a world's golden episode; None: the whole episode."""
 OBSERVATION_SEEDS = ("train:0", "dev:0", "dev:1")
-QUICK = ("train:0",)
+QUICK_SEEDS = ("train:0",)
 """The shortened episode of worlds, which a quick check computes alone."""
 N_OBSERVATIONS = 3
 """Observations of each of these seeds: that of `reset` and those of two steps."""
 N_ENTRIES = 5
 """Nodes of an estimate, and entries of an observation, that a golden file holds."""
-DOUBLE = 1e-6
-SINGLE = 1e-4
+RTOL_FLOAT64 = 1e-6
+RTOL_FLOAT32 = 1e-4
 """Relative tolerances. The reduced filter and stored moments are in single precision."""
 
 
 # -- files ----------------------------------------------------------------------------------------
 
 
-def official_methods() -> dict[str, str]:
+def golden_methods() -> dict[str, str]:
     """Map the name of each method's golden file to the method: a name, or an agent's path."""
-    agents = {card_name(Path(path)): path
-              for id in tracks.ids("injection") for path in reversed(own_agents(id))}
-    return {name: name for track in tracks.TRACKS for name in own_methods(track)} | agents
+    agents = {golden_name(Path(path)): path
+              for id in tracks.ids("injection") for path in reversed(builtin_agents(id))}
+    return {name: name for track in tracks.TRACKS for name in builtin_methods(track)} | agents
 
 
 def golden_path(name: str) -> Path:
@@ -104,7 +104,7 @@ def check(name: str, *, is_quick: bool = False) -> list[str]:
         return _world_differences(name, expected, is_quick=is_quick)
     if is_quick:
         expected["episodes"] = expected["episodes"][:1]
-    return _method_differences(expected, _method_golden(expected, official_methods()[name]))
+    return _method_differences(expected, _method_golden(expected, golden_methods()[name]))
 
 
 def update(names: list[str], *, new_version: bool = False) -> Iterator[tuple[str, str, list[str]]]:
@@ -121,7 +121,7 @@ def update(names: list[str], *, new_version: bool = False) -> Iterator[tuple[str
 
     ``ValueError`` if a name is neither an id nor a built-in method's.
     """
-    ids, methods = tracks.own_ids(), official_methods()
+    ids, methods = tracks.own_ids(), golden_methods()
     if unknown := [name for name in names if name not in ids and name not in methods]:
         raise ValueError(f"names must be ids, or methods of {', '.join(methods)}; got "
                          f"{', '.join(unknown)}")
@@ -153,23 +153,23 @@ def _update_method(name: str, method: str, new_version: bool) -> tuple[str, list
         status = f"v{computed['version']}" if expected else "new"
     if computed != expected:
         write_atomically(golden_path(name), _method_text(computed).encode())
-        card_version.cache_clear()
+        golden_version.cache_clear()
     return status, moved
 
 
-def differences(computed: Any, expected: Any, tolerance: float = DOUBLE,
+def differences(computed: Any, expected: Any, tolerance: float = RTOL_FLOAT64,
                 place: str = "") -> list[str]:
     """Describe each number of two golden files that differs by more than the tolerance.
 
     Both arguments are as JSON gives them. A difference is relative to the largest number of its
-    list; observations of a world have the tolerance `SINGLE`.
+    list; observations of a world have the tolerance `RTOL_FLOAT32`.
     """
     if isinstance(computed, dict) and isinstance(expected, dict):
         if computed.keys() != expected.keys():
             others = ", ".join(sorted(computed.keys() ^ expected.keys()))
             return [f"{place or 'the file'} has other names: {others}"]
         return [line for name in expected for line in differences(
-            computed[name], expected[name], SINGLE if name == "observations" else tolerance,
+            computed[name], expected[name], RTOL_FLOAT32 if name == "observations" else tolerance,
             f"{place}.{name}".lstrip("."))]
     if not (_is_numeric(computed) and _is_numeric(expected)):
         return [] if computed == expected else [f"{place} is {computed!r}, expected {expected!r}"]
@@ -195,9 +195,10 @@ def _is_numeric(value: Any) -> bool:
 
 def world_golden(id: str, *, is_quick: bool = False) -> dict[str, Any]:
     """Compute the golden numbers of a registered id: its world's, and its first observations."""
-    return {"id": id, **world_numbers(entry(id).world, QUICK if is_quick else (*WORLD_EPISODES,)),
-            "observations": {name: first_observations(id, name)
-                             for name in (QUICK if is_quick else OBSERVATION_SEEDS)}}
+    episodes, seeds = (QUICK_SEEDS, QUICK_SEEDS) if is_quick else ((*WORLD_EPISODES,),
+                                                                   OBSERVATION_SEEDS)
+    return {"id": id, **world_numbers(entry(id).world, episodes),
+            "observations": {seed: first_observations(id, seed) for seed in seeds}}
 
 
 @lru_cache(maxsize=2)
@@ -232,7 +233,7 @@ def _rounded(value: Any) -> Any:
 def _world_differences(id: str, expected: dict[str, Any], *, is_quick: bool) -> list[str]:
     computed = json.loads(world_text(world_golden(id, is_quick=is_quick)))
     if is_quick:
-        expected = expected | {part: {name: expected[part][name] for name in QUICK}
+        expected = expected | {part: {name: expected[part][name] for name in QUICK_SEEDS}
                                for part in ("episodes", "observations")}
     return [f"{id}: {sentence}" for sentence in differences(computed, expected)]
 
@@ -346,7 +347,7 @@ def _fixed_action(env: gym.Env, k: int) -> Any:
 def _new_golden(name: str, method: str) -> dict[str, Any]:
     """Choose the episodes of a method's first golden file: those of the first golden file all of
     whose environments the method plays. ``ValueError`` if there is none."""
-    for known in filter(None, map(read_golden, official_methods())):
+    for known in filter(None, map(read_golden, golden_methods())):
         asked = [{key: episode[key] for key in ("environment", "kwargs", "seed")}
                  for episode in known["episodes"]]
         if all(_can_play(method, each["environment"], each["kwargs"]) for each in asked):
@@ -359,8 +360,8 @@ def _can_play(method: str, id: str, kwargs: dict[str, Any]) -> bool:
     asked = tracks.Environment(id, json.dumps(kwargs))
     if is_path(method):
         return Path(method).parents[2].name == id.replace("/", "-")
-    return method in own_methods(asked.track) and playing.can_play(
-        load_method(method, asked.track), playing.environment(asked))
+    return method in builtin_methods(asked.track) and runner.is_compatible(
+        load_method(method, asked.track), runner.cached_environment(asked))
 
 
 def _method_golden(golden: dict[str, Any], method: str) -> dict[str, Any]:
@@ -377,7 +378,7 @@ def _run_episode(episode: dict[str, Any], method: str) -> dict[str, Any]:
     asked = tracks.Environment(episode["environment"], json.dumps(episode["kwargs"]))
     (seed,) = parse_seeds(episode["seed"])
     with threadpool_limits(1):                                  # as for records
-        played = playing.play(asked, load_method(method, asked.track), seed)
+        played = runner.run_method(asked, load_method(method, asked.track), seed)
     numbers = scored(asked.track, played.outcome)
     return {key: episode[key] for key in ("environment", "kwargs", "seed")} | {
         "scores": {score: value for score, value in numbers.items()
@@ -385,7 +386,7 @@ def _run_episode(episode: dict[str, Any], method: str) -> dict[str, Any]:
         **_answer(played)}
 
 
-def _answer(played: playing.Episode) -> dict[str, Any]:
+def _answer(played: runner.EpisodeRun) -> dict[str, Any]:
     if not played.fields:
         return {"injections": [[int(step.argmax()), int(step.argmin())] if step.any() else []
                                for step in played.currents]}

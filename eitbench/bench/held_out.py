@@ -19,7 +19,7 @@ from scipy.stats import permutation_test
 
 from eitbench._files import shipped
 from eitbench.bench.isolation import check_out_of_reach
-from eitbench.bench.methods import is_ours
+from eitbench.bench.methods import is_builtin
 from eitbench.bench.run import Job, run_episode
 from eitbench.bench.text import scores_by_seed
 from eitbench.bench.tracks import FLOORS
@@ -67,12 +67,12 @@ def verify_held_out(record: dict[str, Any], job: Job, secret: bytes,
     The errors of both are relative to those of the naive baseline on the same episodes, which is
     run here too.
 
-    ``job`` is as of `verify.job_of`. Returns a row with the geometric mean of the relative errors,
-    public and held-out, and p; and a sentence for each problem. ``ValueError`` if the episodes are
-    too few for the test, or the method is third-party and not confined by bubblewrap: it could
-    read the seeds.
+    ``job`` comes from `verify.job_for_record`. Returns a row with the geometric mean of the
+    relative errors, public and held-out, and p; and a sentence for each problem. ``ValueError`` if
+    the episodes are too few for the test, or the method is third-party and not confined by
+    bubblewrap: it could read the seeds.
     """
-    if not is_ours(job.method) and job.isolation != "bubblewrap":
+    if not is_builtin(job.method) and job.isolation != "bubblewrap":
         raise ValueError(f"{job.method} must run under bubblewrap on held-out episodes, got "
                          f"isolation {job.isolation}")
     public = scores_by_seed(record, "error")

@@ -41,16 +41,16 @@ from eitbench._files import PACKAGE
 from eitbench._foreign import cleaned, traceback_of, where_of
 from eitbench._notice import say
 from eitbench.bench.methods import (
-    PARAMETERS,
+    MAX_PARAMETERS_BYTES,
+    MAX_TITLE_CHARS,
     ROLES,
-    TITLE,
     Method,
+    builtin_files,
+    builtin_sha256,
     find_method,
-    is_ours,
+    is_builtin,
     is_path,
     load_method,
-    own_files,
-    own_sha256,
 )
 from eitbench.bench.tracks import BOARDS, Environment, is_measured
 from eitbench.data.cache import CACHE_VARIABLE, cache_folder, model_key
@@ -112,7 +112,7 @@ def choose_isolation(environment: Environment, method: str, isolate: str = "auto
     """
     if isolate not in ISOLATE:
         raise ValueError(f"isolate must be one of {', '.join(ISOLATE)}, got {isolate!r}")
-    third_party = not is_ours(method)
+    third_party = not is_builtin(method)
     if is_measured(environment.id):
         if strict and third_party and isolate != "none":
             raise ValueError(f"{method} would run on measurements in this process, which only "
@@ -158,13 +158,13 @@ def bubblewrap(limits: Limits, files: Mapping[str, str] | None = None) -> list[s
     command = ["bwrap", "--unshare-all", "--die-with-parent", "--new-session", "--cap-drop", "ALL",
                "--proc", "/proc", "--dev", "/dev", "--size", str(1 << 26), "--tmpfs", "/dev/shm",
                "--size", str(limits.disk), "--tmpfs", "/tmp"]
-    readable = {place: place for place in map(str, readable_places())}
+    readable = {place: place for place in map(str, readable_paths())}
     for inside, outside in (readable | dict(files or {})).items():
         command += ["--ro-bind-try", outside, inside]
     return [*command, "--remount-ro", "/dev", "--remount-ro", "/", "--chdir", "/tmp"]
 
 
-def readable_places() -> list[Path]:
+def readable_paths() -> list[Path]:
     """Return the files and folders that a worker under bubblewrap reads: Python, installed
     packages, this package and its built-in methods, but nothing else of a checkout."""
     installed = [place for place in sys.path
@@ -184,7 +184,7 @@ def readable_places() -> list[Path]:
 
 def check_out_of_reach(path: Path, name: str) -> None:
     """Raise ``ValueError``, naming what ``name`` calls it, if workers can read the path."""
-    for place in readable_places():
+    for place in readable_paths():
         if path.resolve().is_relative_to(place.resolve()):
             raise ValueError(f"{name} {path} must lie outside {place}, which isolated methods can "
                              "read")
@@ -253,7 +253,7 @@ def load_isolated(track: str, id: str, kwargs: str, method: str, isolation: str)
     name of a built-in method.
     """
     path = find_method(method, track)
-    if is_ours(method):
+    if is_builtin(method):
         loaded = load_method(method, track)
         if loaded.privileged:
             raise ValueError(f"{path} is privileged: it needs the ground truth")
@@ -315,8 +315,8 @@ def _load(key: _Key, path: Path) -> Method:
     if path.suffix == ".py":
         about = about | {"name": path.stem}  # a worker may report any name
     _check_about(path, about, track)
-    built_in = own_files(id).get(about["name"])
-    if built_in is not None and own_sha256(built_in) != sha256:
+    built_in = builtin_files(id).get(about["name"])
+    if built_in is not None and builtin_sha256(built_in) != sha256:
         raise ValueError(f"{path} has the name of a built-in method, {about['name']}, under which "
                          "results are stored; rename it")
     return Method(track, about["name"], about["title"], path, sha256, tuple(about["boards"]),
@@ -329,13 +329,14 @@ def _check_about(path: Path, about: dict[str, Any], track: str) -> None:
     name, title, boards, role = (about.get(key) for key in ("name", "title", "boards", "role"))
     valid = {
         "name": isinstance(name, str) and METHOD_NAME.fullmatch(name) and cleaned(name) == name,
-        "title": isinstance(title, str) and 0 < len(title) <= TITLE and cleaned(title) == title,
+        "title": (isinstance(title, str) and 0 < len(title) <= MAX_TITLE_CHARS
+                  and cleaned(title) == title),
         "role": role is None or role in ROLES,
         "boards": isinstance(boards, list) and boards and all(
             board in BOARDS[track] for board in boards)}
     if wrong := [key for key, is_valid in valid.items() if not is_valid]:
         raise ValueError(f"{path} reports an invalid {', '.join(wrong)}")
-    _check.document(f"{path}: parameters", about.get("parameters"), PARAMETERS)
+    _check.document(f"{path}: parameters", about.get("parameters"), MAX_PARAMETERS_BYTES)
 
 
 class Worker:
@@ -437,7 +438,7 @@ class Worker:
         by_hand = [each for each in runtime_entries() if each.id == id]
         contents = {"method": str(method).encode(),
                     "entry": b"".join(map(cloudpickle.dumps, by_hand))}
-        if is_path(method) and is_ours(method):
+        if is_path(method) and is_builtin(method):
             contents["method"] = str(Path(method).resolve()).encode()
         elif is_path(method):
             path = Path(method)

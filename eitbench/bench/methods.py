@@ -21,39 +21,40 @@ from eitbench._foreign import where_of
 from eitbench._notice import say
 from eitbench.bench.tracks import BOARDS, TRACKS
 
-METHODS = "eitbench.methods"
+METHOD_GROUP = "eitbench.methods"
 """Entry points of installed packages: a method's name, and its module of that name."""
-LOADERS = "eitbench.loaders"
+LOADER_GROUP = "eitbench.loaders"
 """Entry points that load a policy from another kind of file: named by its suffix, called with path
 and content."""
 ROLES = (None, "floor", "reference")
 """Role of a method on a board: ranked, naive baseline, or oracle."""
 
-MOST_BYTES = 1 << 28
+MAX_METHOD_BYTES = 1 << 28
 """of a method's file, which is read whole"""
-TITLE = 120
+MAX_TITLE_CHARS = 120
 """letters of a title"""
-PARAMETERS = 10_000
+MAX_PARAMETERS_BYTES = 10_000
 """bytes of JSON that the parameters of a method may take in a record"""
-ELSEWHERE = ("models of our trained agents are in a checkout only, not in an installed package; "
-             "--policy takes the path of a model.zip")
+AGENTS_NOT_BUNDLED = ("checkpoints of built-in agents are in a checkout only, not in an installed "
+                      "package; --policy takes the path of a model.zip")
 
 
-class Form(NamedTuple):
-    """Form of the methods of a track: their kind in messages, the class that a file defines, its
-    method, the accepted files, and the folder of built-in ones below `baseline_folder`."""
+class MethodKind(NamedTuple):
+    """Kind of the methods of a track: the word for it in messages, the class that a file defines,
+    its method, the accepted files, and the folder of built-in ones below `baseline_folder`."""
 
     kind: str
     type: str
-    answers: str
+    interface: str
     files: str
     folder: str
 
 
-FORMS = {
-    "estimation": Form("baseline", "Estimator", "update(voltages, currents)", "a .py file", "."),
-    "injection": Form("policy", "Policy", "act(observation)",
-                      "a .py file or of an agent's model.zip", "injection"),
+METHOD_KINDS = {
+    "estimation": MethodKind("baseline", "Estimator", "update(voltages, currents)", "a .py file",
+                             "."),
+    "injection": MethodKind("policy", "Policy", "act(observation)",
+                            "a .py file or of an agent's model.zip", "injection"),
 }
 
 
@@ -97,12 +98,13 @@ def baseline_folder() -> Path:
     return shipped("baselines")
 
 
-def own_methods(track: str) -> list[str]:
+def builtin_methods(track: str) -> list[str]:
     """Return the names of the built-in methods of a track, without agents."""
-    return sorted(path.stem for path in (baseline_folder() / FORMS[track].folder).glob("*.py"))
+    folder = baseline_folder() / METHOD_KINDS[track].folder
+    return sorted(path.stem for path in folder.glob("*.py"))
 
 
-def own_agents(id: str) -> list[str]:
+def builtin_agents(id: str) -> list[str]:
     """Return the paths of the built-in agents of an environment; none without the extra ``rl``, and
     none, with a notice, where their models are missing."""
     if not importlib.util.find_spec("stable_baselines3"):
@@ -110,14 +112,14 @@ def own_agents(id: str) -> list[str]:
     agents = _agents(id)
     found = [str(path) for path in agents if path.is_file()]
     if agents and not found:
-        say(f"our agents for {id} are left out: {ELSEWHERE}")
+        say(f"our agents for {id} are left out: {AGENTS_NOT_BUNDLED}")
     return found
 
 
-def own_files(id: str) -> dict[str, Path]:
+def builtin_files(id: str) -> dict[str, Path]:
     """Map the name under which results are stored to the file, of each built-in method and of the
     agents of an environment, whose models may be missing."""
-    folders = [baseline_folder() / form.folder for form in FORMS.values()]
+    folders = [baseline_folder() / form.folder for form in METHOD_KINDS.values()]
     return ({path.stem: path for folder in folders for path in sorted(folder.glob("*.py"))}
             | {f"{path.parents[1].name}_{path.parent.name}": path for path in _agents(id)})
 
@@ -128,18 +130,18 @@ def _agents(id: str) -> list[Path]:
     return [path.with_name("model.zip") for path in sorted(folder.glob("*/seed*/sha256"))]
 
 
-def own_sha256(path: Path) -> str:
+def builtin_sha256(path: Path) -> str:
     """Return the sha256 of a built-in method's file; an agent's was written by its training."""
     if path.suffix == ".py":
         return hashlib.sha256(path.read_bytes()).hexdigest()
     return path.with_name("sha256").read_text(encoding="ascii").strip()
 
 
-def is_ours(name: str) -> bool:
+def is_builtin(name: str) -> bool:
     """Return whether a method, by name or by path, is built in: it lies in our folder."""
     if is_path(name):
         return Path(name).resolve().is_relative_to(baseline_folder().resolve())
-    return any(name in own_methods(track) for track in TRACKS)
+    return any(name in builtin_methods(track) for track in TRACKS)
 
 
 def is_path(name: str) -> bool:
@@ -149,16 +151,16 @@ def is_path(name: str) -> bool:
 
 @lru_cache(maxsize=1)
 def installed_methods() -> dict[str, Path]:
-    """Map name to file of each method of installed packages (entry points `METHODS`); one that has
-    a built-in name, or no file, is left out with a warning."""
+    """Map name to file of each method of installed packages (entry points `METHOD_GROUP`). A method
+    that has a built-in name, or no file, is left out with a warning."""
     found = {}
-    for point in entry_points(group=METHODS):
+    for point in entry_points(group=METHOD_GROUP):
         try:
             specification = importlib.util.find_spec(point.value)
         except ImportError:
             specification = None
         path = Path(specification.origin) if specification and specification.origin else None
-        if is_ours(point.name) or path is None or path.stem != point.name:
+        if is_builtin(point.name) or path is None or path.stem != point.name:
             warnings.warn(f"method {point.name} of {point.value} is left out: it must be a module "
                           "of that name, and none of ours may have it", stacklevel=2)
         else:
@@ -169,7 +171,7 @@ def installed_methods() -> dict[str, Path]:
 @lru_cache(maxsize=1)
 def _loaders() -> dict[str, EntryPoint]:
     """Map suffixes to loaders."""
-    return {f".{point.name}": point for point in entry_points(group=LOADERS)}
+    return {f".{point.name}": point for point in entry_points(group=LOADER_GROUP)}
 
 
 def loader_of(path: Path) -> str:
@@ -181,10 +183,10 @@ def loader_of(path: Path) -> str:
 def version_of(path: Path, sha256: str) -> str:
     """Return the version that records name: of a built-in method that of its golden file, of others
     eight digits of their file's sha256."""
-    return f"v{card_version(card_name(path))}" if is_ours(str(path)) else sha256[:8]
+    return f"v{golden_version(golden_name(path))}" if is_builtin(str(path)) else sha256[:8]
 
 
-def card_name(path: Path) -> str:
+def golden_name(path: Path) -> str:
     """Return the name of a built-in method's golden file: that of its file; agents of one
     environment and algorithm share one."""
     folders = path.resolve().parents
@@ -192,7 +194,7 @@ def card_name(path: Path) -> str:
 
 
 @lru_cache(maxsize=256)
-def card_version(name: str) -> int:
+def golden_version(name: str) -> int:
     """Return the version of a golden file; 1 if it is missing."""
     path = baseline_folder() / "golden" / f"{name}.json"
     if not path.is_file():
@@ -203,9 +205,9 @@ def card_version(name: str) -> int:
 def find_method(name: str, track: str) -> Path:
     """Return the file of a method by its name, if it is built in or installed, or by its path.
     ``ValueError`` if there is none, or it has the name of another."""
-    form = FORMS[track]
+    form = METHOD_KINDS[track]
     folder = baseline_folder() / form.folder
-    own = own_methods(track)
+    own = builtin_methods(track)
     if is_path(name):
         path = readable(Path(name))
     else:
@@ -213,12 +215,12 @@ def find_method(name: str, track: str) -> Path:
         path = known.get(name, Path())
     if not path.is_file():
         names = [*own, *installed_methods()]
-        hint = (f": {ELSEWHERE}" if "checkpoints" in path.parts
+        hint = (f": {AGENTS_NOT_BUNDLED}" if "checkpoints" in path.parts
                 else _check.nearest(name, names))
         raise ValueError(f"{form.kind} must be the path of {form.files}, or one of "
                          f"{', '.join(names)}; got {name!r}{hint}")
-    if path.stat().st_size > MOST_BYTES:
-        raise ValueError(f"{form.kind} {path} must have {MOST_BYTES >> 20} MiB at most")
+    if path.stat().st_size > MAX_METHOD_BYTES:
+        raise ValueError(f"{form.kind} {path} must have {MAX_METHOD_BYTES >> 20} MiB at most")
     if path.stem in own and not path.samefile(folder / f"{path.stem}.py"):
         raise ValueError(f"{form.kind} {path} has the name of one of ours, under which results are "
                          "kept; rename it")
@@ -237,27 +239,27 @@ def load_method(name: str, track: str) -> Method:
 def _load(path: Path, source: bytes, track: str) -> Method:
     """Load the file with this content, which is executed once a process."""
     sha256 = hashlib.sha256(source).hexdigest()
-    form = FORMS[track]
+    form = METHOD_KINDS[track]
     if track == "injection" and path.suffix in _loaders():
         name, title, agent, parameters = _loaders()[path.suffix].load()(path, source)
-        _check.document(f"{form.kind} {path}: parameters", parameters, PARAMETERS)
+        _check.document(f"{form.kind} {path}: parameters", parameters, MAX_PARAMETERS_BYTES)
         return Method(track, name, title, path, sha256, BOARDS[track], parameters, agent)
     module = load_module(form.kind, path, source)
     method = getattr(module, form.type, None)
     if not isinstance(method, type):
         raise ValueError(f"{form.kind} {path} must define a class {form.type} with a method "
-                         f"{form.answers}")
-    return method_of(method, track, path.stem, str(path))._replace(
+                         f"{form.interface}")
+    return method_from_class(method, track, path.stem, str(path))._replace(
         title=title_of(module, path), path=path, sha256=sha256)
 
 
-def method_of(method: type[Any], track: str, name: str, where: str = "") -> Method:
+def method_from_class(method: type[Any], track: str, name: str, where: str = "") -> Method:
     """Return a class as a method of a track, without a file. ``ValueError``, naming ``where`` it is
     (default: its name), if it is not as the track requires."""
-    form = FORMS[track]
+    form = METHOD_KINDS[track]
     who = f"{form.kind} {where or name}: {method.__name__}"
-    if not callable(getattr(method, form.answers.partition("(")[0], None)):
-        raise ValueError(f"{who} must have a method {form.answers}")
+    if not callable(getattr(method, form.interface.partition("(")[0], None)):
+        raise ValueError(f"{who} must have a method {form.interface}")
     boards = tuple(getattr(method, "boards", BOARDS[track][:1]))
     if not boards or not set(boards) <= set(BOARDS[track]):
         raise ValueError(f"{who}.boards must be some of {', '.join(BOARDS[track])}, got {boards!r}")
@@ -269,7 +271,7 @@ def method_of(method: type[Any], track: str, name: str, where: str = "") -> Meth
         raise ValueError(f"{who}.privileged must be True or False, got {privileged!r}")
     given = getattr(method, "parameters", {})
     parameters = dict(given) if isinstance(given, Mapping) else given
-    _check.document(f"{who}.parameters", parameters, PARAMETERS)
+    _check.document(f"{who}.parameters", parameters, MAX_PARAMETERS_BYTES)
     return Method(track, name, name, Path(), "", boards, parameters, method, role, privileged)
 
 
@@ -292,7 +294,7 @@ def load_module(kind: str, path: Path, source: bytes) -> ModuleType:
 
 
 def title_of(module: ModuleType, path: Path) -> str:
-    """Return the first line of the docstring, up to a colon, bracket or full stop, `TITLE` letters
-    at most; without one, the file's name."""
+    """Return the first line of the docstring, up to a colon, bracket or full stop, and at most
+    `MAX_TITLE_CHARS` characters; without a docstring the file's name."""
     line = f"{(module.__doc__ or '').strip()}\n".splitlines()[0]
-    return re.split(r"[:(.]", line)[0].strip()[:TITLE].strip() or path.stem
+    return re.split(r"[:(.]", line)[0].strip()[:MAX_TITLE_CHARS].strip() or path.stem

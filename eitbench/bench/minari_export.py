@@ -11,7 +11,7 @@ from tqdm import tqdm
 
 from eitbench._extras import needed_by
 from eitbench.bench.methods import Method, load_method
-from eitbench.bench.playing import policys_random
+from eitbench.bench.runner import policy_generator
 from eitbench.bench.tracks import check_track
 from eitbench.data.dataset import resolve_seeds
 from eitbench.data.export import WARNING
@@ -83,7 +83,7 @@ def _run(env: gym.Env[Any, Any], policy: Method, seed: int, number: int) -> Epis
     inner: Any = env.unwrapped
     with allow_test_seeds():
         observations = [env.reset(seed=seed)[0]]
-    player = policy.make(inner.rules, policys_random(seed), *[inner.core] * policy.privileged)
+    player = policy.make(inner.rules, policy_generator(seed), *[inner.core] * policy.privileged)
     steps: list[tuple[Any, ...]] = []
     ended = False
     while not ended:

@@ -20,7 +20,7 @@ from eitbench.worlds.world import World
 
 
 @dataclass
-class Said:
+class EstimatorOutput:
     """Outputs and inputs of an estimator in one episode."""
 
     means: np.ndarray
@@ -42,7 +42,7 @@ class Said:
     def collect(
         cls, task: Task,
         played: Iterable[tuple[int, Estimate | None, dict[str, np.ndarray], float]],
-    ) -> Said:
+    ) -> EstimatorOutput:
         """Collect (t, estimate, measurement, seconds) step by step."""
         means = np.full((task.n_steps, task.mesh.n_nodes), np.nan)
         variances = means.copy()
@@ -82,7 +82,7 @@ class Said:
         return fields
 
 
-def outcome_of(env: EstimationEnv, said: Said) -> Outcome:
+def estimation_outcome(env: EstimationEnv, said: EstimatorOutput) -> Outcome:
     """Return the outcome of the episode that has just ended in ``env``."""
     task = env.task
     interpolation, mass = region_operators(env.world)
@@ -115,7 +115,7 @@ def outcome_of(env: EstimationEnv, said: Said) -> Outcome:
         innovations=innovations, std=std, velocity=velocity)
 
 
-class Claim(NamedTuple):
+class ScoredEstimate(NamedTuple):
     """Estimate of a scored state by the filter inside an environment."""
 
     t: int
@@ -129,10 +129,10 @@ class Claim(NamedTuple):
     """of the accepted readings; None if there are none"""
 
 
-def outcome_of_claims(world: World, seed: int, claims: list[Claim], seconds_per_step: float,
-                      spent: int) -> Outcome:
+def injection_outcome(world: World, seed: int, estimates: list[ScoredEstimate],
+                      seconds_per_step: float, spent: int) -> Outcome:
     """Return the outcome of an episode in which a policy made ``spent`` injections."""
-    states, errors, means, stds, innovations = zip(*claims, strict=True)
+    states, errors, means, stds, innovations = zip(*estimates, strict=True)
     interpolation, mass = region_operators(world)
     truth = simulate(world, seed, progress=False).concentration[list(states)].astype(float)
     used = [innovation for innovation in innovations if innovation is not None]

@@ -13,7 +13,7 @@ from eitbench.data.episode_cache import csr_of, prefix_file, region_file, scorin
 from eitbench.estimation.onboard.models import build_packed_model, reduced_model_key, unpack_model
 from eitbench.worlds.registry import Entry, entries, entry
 
-TOLERANCE = 1e-5
+ARRAY_TOLERANCE = 1e-5
 """Accepted difference relative to an array's largest entry: models are kept in single precision."""
 
 
@@ -66,7 +66,7 @@ def unused_files() -> list[str]:
 
 
 def difference(shipped: Arrays | None, built: Arrays) -> str:
-    """Return how shipped arrays differ from those built now; empty within `TOLERANCE`.
+    """Return how shipped arrays differ from those built now; empty within `ARRAY_TOLERANCE`.
 
     Another processor may choose another basis of the same space: models are compared in one. It
     may also round to zero other entries of a sparse matrix.
@@ -84,7 +84,7 @@ def difference(shipped: Arrays | None, built: Arrays) -> str:
         shipped = _in_basis(shipped, built["basis"])
     for name, array in built.items():
         off = np.abs(shipped[name].astype(float) - array).max() / (np.abs(array).max() or 1.0)
-        if not off <= TOLERANCE:
+        if not off <= ARRAY_TOLERANCE:
             return f"{name} differs by {off:.2g} of its largest entry"
     return ""
 

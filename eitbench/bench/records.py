@@ -41,7 +41,7 @@ from eitbench.data.seeds import format_seed, parse_seeds
 
 SCHEMA = 3
 BOARDS = tracks.ALL_BOARDS
-SHARED = ("board", "title", "parameters", "role", "privileged", "version", "method_sha256",
+COMMON_FIELDS = ("board", "title", "parameters", "role", "privileged", "version", "method_sha256",
           "checkpoint_sha256")
 """Fields that all episodes of a record have in common, beside environment and method."""
 MAX_BYTES = 2**23
@@ -59,10 +59,10 @@ _BUILTIN_VERSION = re.compile(r"v([1-9][0-9]*)")
 def write_record(folder: Path, record: dict[str, Any]) -> Path:
     """Write a record into ``folder`` atomically and return its path; a file of the same name is
     replaced. ``ValueError``, naming file and fields, if it breaks the schema."""
-    record = sealed(record)
+    record = with_content_hash(record)
     name = "(nameless)"
     with suppress(KeyError, TypeError):               # the check names the missing field
-        name = file_name(record)
+        name = record_file_name(record)
     path = Path(folder) / name
     try:
         check_record(record)
@@ -84,8 +84,9 @@ def read_record(path: Path) -> dict[str, Any]:
         if record["sha256"] != _digest(record):
             raise ValueError("was changed since it was written: its sha256 is not that of its "
                              "content")
-        if path.name != file_name(record):
-            raise ValueError(f"must have the name {file_name(record)}, as its content requires")
+        if path.name != record_file_name(record):
+            raise ValueError(f"must have the name {record_file_name(record)}, as its content "
+                             "requires")
     except (OSError, ValueError) as error:
         raise ValueError(f"record {cleaned(str(path))} {cleaned(str(error))}") from None
     return record
@@ -118,13 +119,13 @@ def read_records(folder: Path, *, keep: Callable[[dict[str, Any]], Any] = dict) 
     folder = Path(folder)
     if not folder.is_dir() and (table := table_beside(folder)).is_file():
         return [keep(record) for record in read_episode_table(table)]
-    records, complaints = read_sound_files(folder, keep=keep)
+    records, complaints = read_valid_files(folder, keep=keep)
     if complaints:
         raise ValueError("; ".join(complaints))
     return list(records.values())
 
 
-def read_sound_files(folder: Path, *, keep: Callable[[dict[str, Any]], Any] = dict,
+def read_valid_files(folder: Path, *, keep: Callable[[dict[str, Any]], Any] = dict,
                      measured: bool = False) -> tuple[dict[Path, Any], list[str]]:
     """Read the valid records of a folder, by path, and a sentence for each other file that names
     it; with ``measured`` only records of measured cases, else only others."""
@@ -148,13 +149,13 @@ def read_sound_files(folder: Path, *, keep: Callable[[dict[str, Any]], Any] = di
     return kept, complaints
 
 
-def file_name(record: dict[str, Any]) -> str:
+def record_file_name(record: dict[str, Any]) -> str:
     """Return the name of a record's file; see `tracks.record_name`."""
     return tracks.record_name(record["environment"]["name"], record["method"], record["version"],
                               record["split"])
 
 
-def sealed(record: dict[str, Any]) -> dict[str, Any]:
+def with_content_hash(record: dict[str, Any]) -> dict[str, Any]:
     """Return the record with the ``sha256`` of its content: canonical JSON of all other fields."""
     content = {key: value for key, value in record.items() if key != "sha256"}
     try:
@@ -199,12 +200,12 @@ def version_number(version: str) -> int | None:
     return int(version[1:]) if _BUILTIN_VERSION.fullmatch(version) else None
 
 
-def finished(record: dict[str, Any]) -> str:
+def finished_at(record: dict[str, Any]) -> str:
     """Return the time of its last episode, in UTC as ISO 8601."""
     return max(episode["finished"] for episode in record["episodes"])
 
 
-def alike(runs: Iterable[dict[str, Any]], *keys: str) -> list[list[dict[str, Any]]]:
+def group_runs(runs: Iterable[dict[str, Any]], *keys: str) -> list[list[dict[str, Any]]]:
     """Group runs by code, these ``keys`` and machine, whose matrix product each process times."""
     groups: dict[str, list[dict[str, Any]]] = {}
     for run in runs:
@@ -215,7 +216,8 @@ def alike(runs: Iterable[dict[str, Any]], *keys: str) -> list[list[dict[str, Any
     return list(groups.values())
 
 
-def newest(records: list[dict[str, Any]]) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
+def split_outdated(records: list[dict[str, Any]],
+                   ) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
     """Separate records that may stand on a board together from outdated ones, each in the given
     order.
 

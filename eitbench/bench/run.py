@@ -21,8 +21,8 @@ from eitbench._foreign import traceback_of, where_of
 from eitbench.bench import isolation
 from eitbench.bench.isolation import WorkerError, load_isolated
 from eitbench.bench.methods import Method, find_method, load_method, loader_of, version_of
-from eitbench.bench.playing import environment, play
-from eitbench.bench.records import SHARED
+from eitbench.bench.records import COMMON_FIELDS
+from eitbench.bench.runner import cached_environment, run_method
 from eitbench.bench.scores import SCORING, scored
 from eitbench.bench.store import EpisodeStore, machine, portable_command, provenance
 from eitbench.bench.tracks import Environment, board_of, is_measured, registered
@@ -33,7 +33,7 @@ from eitbench.data.seeds import format_seed
 from eitbench.measured.cases import read_case
 from eitbench.worlds.registry import entry
 
-_LASTING = ("environment", "method", *SHARED)
+_INVARIANT_FIELDS = ("environment", "method", *COMMON_FIELDS)
 """Fields of a result that a method may not change during a run."""
 
 
@@ -90,12 +90,12 @@ def run_episode(job: Job) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     estimates' means and standard deviations (float32; empty for policies and after a failure).
     """
     method = job.load()
-    result = _beginning(job, method)
+    result = _initial_result(job, method)
     fields: dict[str, np.ndarray] = {}
     begin = time.perf_counter()
     try:
         with threadpool_limits(1), redirect_stdout(sys.stderr):  # standard output is for tables
-            played = play(job.environment, method, job.seed)
+            played = run_method(job.environment, method, job.seed)
             numbers = scored(method.track, played.outcome)
         scores = {"scores": numbers, "step_errors": played.outcome.errors.tolist()}
         if played.actions is not None:
@@ -105,14 +105,14 @@ def run_episode(job: Job) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
         fields = played.fields
     # an error of a method is its result
     except (Exception, SystemExit) as error:
-        result |= _failure(error, method.path)
+        result |= _failure_result(error, method.path)
     if job.isolation != "none":
         result["peak_memory"] = isolation.peak_memory()
     result |= {"finished": _now(), "seconds": time.perf_counter() - begin}
     return result, fields
 
 
-def _beginning(job: Job, method: Method) -> dict[str, Any]:
+def _initial_result(job: Job, method: Method) -> dict[str, Any]:
     """Return the fields of a result that are known before the episode runs."""
     asked = job.environment
     own = ("title", "parameters", "role", "privileged", "version")
@@ -120,7 +120,7 @@ def _beginning(job: Job, method: Method) -> dict[str, Any]:
         "identity": job.identity(), "seed": format_seed(job.seed), "method": method.name,
         **{name: getattr(method, name) for name in own}, "method_sha256": method.sha256,
         "checkpoint_sha256": method.sha256 if method.path.suffix == ".zip" else None,
-        "board": board_of(environment(asked)),
+        "board": board_of(cached_environment(asked)),
         "environment": {"id": asked.id, "name": asked.name, "kwargs": asked.given},
         "finished": _now(), "peak_memory": None, "seconds": 0.0}
 
@@ -129,7 +129,7 @@ def _now() -> str:
     return datetime.now(UTC).isoformat(timespec="microseconds")
 
 
-def _failure(error: BaseException, own: Path) -> dict[str, Any]:
+def _failure_result(error: BaseException, own: Path) -> dict[str, Any]:
     """Return the fields of a failed result; ``own`` is the method's file."""
     if isinstance(error, WorkerError):
         return {"status": "failed", "message": str(error), "where": error.where,
@@ -146,22 +146,22 @@ def run_jobs(jobs: list[Job], store: EpisodeStore, *, n_jobs: int = 1, backend: 
     Clusters (``backend``, see `eitbench.data.parallel.run_parallel`) need the folders of ``store``
     and cache on all machines. Results name ``command``, without folders.
     """
-    todo = [job for job in jobs
-            if not store.holds(job.environment.name, job.load().name, job.seed, job.identity())]
+    todo = [job for job in jobs if not store.has_result(job.environment.name, job.load().name,
+                                                        job.seed, job.identity())]
     if len(todo) < len(jobs):
         tqdm.write(f"{len(jobs) - len(todo)} of {len(jobs)} episodes are already there")
     if not todo:
         return
     truths: dict[Any, Job] = {}  # each is simulated once, before several methods need it
     for job in (job for job in todo if not is_measured(job.environment.id)):
-        truths.setdefault((environment(job.environment).world, job.seed), job)
+        truths.setdefault((cached_environment(job.environment).world, job.seed), job)
     run = {"command": portable_command(command), **provenance(), "machine": machine()}
     home = platform.node()
     isolation.close()                               # that of `Job.load`; the workers have their own
     try:
         for function, work, label in (
             (_simulate_job, [(job,) for job in truths.values()], "simulating truths"),
-            (_run_job, [(job, store, run, home, _beginning(job, job.load()), keep_estimates)
+            (_run_job, [(job, store, run, home, _initial_result(job, job.load()), keep_estimates)
                         for job in todo],
              "running methods"),
         ):
@@ -172,7 +172,7 @@ def run_jobs(jobs: list[Job], store: EpisodeStore, *, n_jobs: int = 1, backend: 
         isolation.close()
 
 
-def successful(jobs: Iterable[Job],
+def successful_results(jobs: Iterable[Job],
                results: Iterable[dict[str, Any]]) -> dict[Job, dict[str, Any]]:
     """Map the jobs that have one to their first successful result: of the same environment, method,
     version and seed, by any code."""
@@ -187,26 +187,26 @@ def successful(jobs: Iterable[Job],
     return {job: first[key] for job, key in keys.items() if key in first}
 
 
-def unplayed(jobs: Sequence[Job], results: Iterable[dict[str, Any]]) -> list[Job]:
+def pending_jobs(jobs: Sequence[Job], results: Iterable[dict[str, Any]]) -> list[Job]:
     """Return the jobs without a successful result."""
-    done = successful(jobs, results)
+    done = successful_results(jobs, results)
     return [job for job in jobs if job not in done]
 
 
 def _simulate_job(job: Job) -> None:
-    simulate(environment(job.environment).world, job.seed, progress=False)
+    simulate(cached_environment(job.environment).world, job.seed, progress=False)
 
 
 def _run_job(job: Job, store: EpisodeStore, run: dict[str, Any], home: str,
              beginning: dict[str, Any], keep_estimates: bool) -> None:
     try:
         result, fields = run_episode(job)
-        if any(result[name] != beginning[name] for name in _LASTING):
+        if any(result[name] != beginning[name] for name in _INVARIANT_FIELDS):
             raise ValueError(f"{job.method}: metadata changed between episodes")
         # a world of a script is identified by the script's file, which this process lacks
         result["identity"] = beginning["identity"]
     except Exception as error:
-        result, fields = beginning | _failure(error, Path(job.method)), {}
+        result, fields = beginning | _failure_result(error, Path(job.method)), {}
     if not keep_estimates:
         fields = {}
     elsewhere = {} if platform.node() == home else {"machine": machine()}

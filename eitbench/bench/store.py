@@ -24,13 +24,13 @@ from threadpoolctl import threadpool_limits
 from eitbench._files import PACKAGE, write_atomically
 from eitbench._foreign import cleaned
 from eitbench.bench.records import (
+    COMMON_FIELDS,
     SCHEMA,
-    SHARED,
     check_record,
     read_json,
     read_records,
-    sealed,
     split_of,
+    with_content_hash,
     write_record,
 )
 from eitbench.bench.scores import SCORING
@@ -40,7 +40,7 @@ from eitbench.data.seeds import format_seed
 PACKAGES = ("eitbench", "numpy", "scipy", "gymnasium", "scikit-fem", "numba", "stable-baselines3",
             "sb3-contrib", "torch")
 """Packages whose versions a record names."""
-_OF_ALL = ("environment", "method", *SHARED)
+_OF_ALL = ("environment", "method", *COMMON_FIELDS)
 """Fields that the results of one record have in common."""
 _LOCAL = ("traceback",)
 """Fields of a result that its user sees and a record does not have."""
@@ -69,7 +69,7 @@ class EpisodeStore:
             write_atomically(path.with_suffix(".npz"), content.getvalue())
         write_atomically(path, json.dumps(result, indent=1, allow_nan=False).encode())
 
-    def holds(self, environment: str, method: str, seed: int, identity: str) -> bool:
+    def has_result(self, environment: str, method: str, seed: int, identity: str) -> bool:
         """Return whether a successful result of exactly this identity is there."""
         try:
             result = self.result(environment, method, seed)
@@ -195,7 +195,7 @@ def _gathered(results: list[dict[str, Any]]) -> dict[str, Any]:
     texts = [json.dumps(result["run"], sort_keys=True) for result in results]
     runs = dict(zip(texts, (result["run"] for result in results), strict=True))
     place = {run: i for i, run in enumerate(runs)}
-    return sealed({
+    return with_content_hash({
         "schema": SCHEMA, "official": False, "split": split_of(latest["seed"]),
         **{key: latest[key] for key in _OF_ALL},
         "seeds": [result["seed"] for result in results], "runs": list(runs.values()),
@@ -204,7 +204,7 @@ def _gathered(results: list[dict[str, Any]]) -> dict[str, Any]:
     })
 
 
-def results_of(record: dict[str, Any]) -> list[dict[str, Any]]:
+def record_results(record: dict[str, Any]) -> list[dict[str, Any]]:
     """Return the results that were gathered into a record, as a store would hold them."""
     shared = {key: record[key] for key in _OF_ALL if key in record}
     runs = record.get("runs", [])
@@ -212,9 +212,9 @@ def results_of(record: dict[str, Any]) -> list[dict[str, Any]]:
             for episode in record["episodes"]]
 
 
-def results_in(folder: Path) -> list[dict[str, Any]]:
+def folder_results(folder: Path) -> list[dict[str, Any]]:
     """Return the results of all records of a folder. Errors as `records.read_records`."""
-    return [result for record in read_records(folder) for result in results_of(record)]
+    return [result for record in read_records(folder) for result in record_results(record)]
 
 
 def _read(path: Path) -> dict[str, Any]:

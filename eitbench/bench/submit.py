@@ -8,8 +8,8 @@ from typing import Any
 
 from eitbench.bench import suites, tracks
 from eitbench.bench.records import read_record, split_of, write_record
-from eitbench.bench.run import Job, run_jobs, unplayed
-from eitbench.bench.store import EpisodeStore, provenance, results_of
+from eitbench.bench.run import Job, pending_jobs, run_jobs
+from eitbench.bench.store import EpisodeStore, provenance, record_results
 from eitbench.bench.text import seed_ranges
 from eitbench.data.seeds import format_seed
 
@@ -61,8 +61,8 @@ def _submitted(jobs: list[Job], store: EpisodeStore, to: Path, split: str, offic
     """Run the jobs of one environment and write their records."""
     earlier = _earlier(to, jobs, split, official)
     before = [result for record in earlier.values() if record["official"] == official
-              for result in results_of(record)]
-    run_jobs(unplayed(jobs, before), store, n_jobs=n_jobs, backend=backend, command=command)
+              for result in record_results(record)]
+    run_jobs(pending_jobs(jobs, before), store, n_jobs=n_jobs, backend=backend, command=command)
     asked = _versions(jobs)
     made = [record | {"official": official} for record in store.records(also=before)
             if (record["environment"]["name"], record["method"], record["version"]) in asked
@@ -87,7 +87,7 @@ def _jobs(method: str | None, id: str, policy: bool, seeds: list[int] | None,
     methods = [] if method is None else [method]
     asked = "injection" if policy else "estimation"
     track = tracks.track_of(id) if method is None else asked
-    return suites.jobs(track, [id], methods, seeds, isolate=isolate, strict=official)
+    return suites.make_jobs(track, [id], methods, seeds, isolate=isolate, strict=official)
 
 
 def _versions(jobs: list[Job]) -> list[tuple[str, str, str]]:

@@ -8,18 +8,18 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from eitbench.bench import playing
+from eitbench.bench import runner
 from eitbench.bench.isolation import choose_isolation
 from eitbench.bench.methods import (
-    FORMS,
+    METHOD_KINDS,
+    builtin_agents,
+    builtin_methods,
     find_method,
     installed_methods,
     is_path,
-    own_agents,
-    own_methods,
 )
-from eitbench.bench.playing import can_play
 from eitbench.bench.run import Job
+from eitbench.bench.runner import is_compatible
 from eitbench.bench.tracks import (
     ESTIMATORS,
     QUICK,
@@ -34,9 +34,10 @@ TOO_SLOW_FOR_QUICK = {("filter", "gauss_newton")}
 """A reconstruction at every step takes minutes an episode."""
 
 
-def jobs(track: str, environments: list[str], methods: list[str], seeds: list[int] | None = None, *,
-         suite: str = "full", estimator: str = "full", isolate: str = "auto", strict: bool = False,
-         worlds: Sequence[dict[str, Any]] = ({},)) -> list[Job]:
+def make_jobs(track: str, environments: list[str], methods: list[str],
+              seeds: list[int] | None = None, *, suite: str = "full", estimator: str = "full",
+              isolate: str = "auto", strict: bool = False,
+              worlds: Sequence[dict[str, Any]] = ({},)) -> list[Job]:
     """Return the jobs of each named method (default: all built-in ones, with trained agents) in
     each environment that it suits, ordered by environment, method and seed.
 
@@ -60,23 +61,23 @@ def jobs(track: str, environments: list[str], methods: list[str], seeds: list[in
     for id, changes in itertools.product(environments, worlds):
         check_track(id, track)
         asked = Environment(id, json.dumps(given | ({"world": changes} if changes else {})))
-        env = _to_look_at(asked)
+        env = _probe_environment(asked)
         board = board_of(env)
         numbers = default_seeds(id, suite) if seeds is None else seeds
         # Environment by environment, since models are kept for a few only, and a worker
         # serves one method.
-        for method in methods or [*own_methods(track), *own_agents(id)]:
+        for method in methods or [*builtin_methods(track), *builtin_agents(id)]:
             skipped = suite == "quick" and not methods and (board, method) in TOO_SLOW_FOR_QUICK
             job = isolated_job(asked, method, isolate, strict)
             loaded = job.load()
             names[method] = loaded.name
-            if not skipped and can_play(loaded, env):
+            if not skipped and is_compatible(loaded, env):
                 fitting.add(method)
                 todo += [job._replace(seed=seed) for seed in numbers]
-    _distinct(names)
+    _check_unique_names(names)
     if missing := [method for method in methods if method not in fitting]:
-        raise ValueError(f"{FORMS[track].kind} {', '.join(missing)} plays none of the environments "
-                         f"{', '.join(environments)}; see `eitbench list`")
+        raise ValueError(f"{METHOD_KINDS[track].kind} {', '.join(missing)} suits none of the "
+                         f"environments {', '.join(environments)}; see `eitbench list`")
     return todo
 
 
@@ -87,15 +88,15 @@ def isolated_job(environment: Environment, method: str, isolate: str,
     return Job(environment, _absolute(method), 0, kind)
 
 
-def _to_look_at(asked: Environment) -> Any:
+def _probe_environment(asked: Environment) -> Any:
     """Make the environment with the filter that is made fastest, for its board and rules only."""
     if asked.track == "injection":
         kwargs = json.loads(asked.kwargs) | {"estimator": "reduced"}
         asked = asked._replace(kwargs=json.dumps(kwargs))
-    return playing.environment(asked)
+    return runner.cached_environment(asked)
 
 
-def _distinct(names: dict[str, str]) -> None:
+def _check_unique_names(names: dict[str, str]) -> None:
     """Raise ``ValueError`` if results of two methods would be stored under one name."""
     first: dict[str, str] = {}
     for file, name in names.items():

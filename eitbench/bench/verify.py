@@ -17,23 +17,23 @@ from eitbench import _check
 from eitbench.bench.isolation import WorkerError, choose_isolation
 from eitbench.bench.methods import (
     Method,
+    builtin_files,
+    builtin_sha256,
     find_method,
     installed_methods,
-    is_ours,
+    is_builtin,
     is_path,
-    own_files,
-    own_sha256,
 )
-from eitbench.bench.playing import play
 from eitbench.bench.records import (
-    SHARED,
-    file_name,
-    newest,
+    COMMON_FIELDS,
     read_record,
-    read_sound_files,
+    read_valid_files,
+    record_file_name,
+    split_outdated,
     version_number,
 )
 from eitbench.bench.run import Job, run_jobs
+from eitbench.bench.runner import run_method
 from eitbench.bench.scores import scored, scores
 from eitbench.bench.store import EpisodeStore
 from eitbench.bench.table import Cell, Table
@@ -45,18 +45,19 @@ from eitbench.data.seeds import parse_seeds
 
 BUILTIN_FIELDS = ("method", "board", "role", "privileged")
 """Fields that a rerun of a built-in method must repeat; its title may have changed."""
-TOLERANCE = 1e-6
+SCORE_TOLERANCE = 1e-6
 """relative difference of scores within which they agree: processors sum in different orders"""
 MANY_ROWS = 30
 """From here on a table has a row for each environment instead of each episode."""
 
 
-EMPTY = {"record": "", "environment": "", "method": "", "episode": "", "isolation": "", "score": "",
-         "difference": 0.0, "recorded": None, "rerun": None, "problem": "", "note": ""}
+EMPTY_ROW = {"record": "", "environment": "", "method": "", "episode": "", "isolation": "",
+             "score": "", "difference": 0.0, "recorded": None, "rerun": None, "problem": "",
+             "note": ""}
 """Columns of `verify`, with the values of a record that cannot be read."""
 
 
-class Case(NamedTuple):
+class EpisodeCheck(NamedTuple):
     """One episode of one record, to be rerun by a job, or to be replayed."""
 
     record: dict[str, Any]
@@ -69,7 +70,7 @@ def verify(paths: Sequence[Path], folder: Path, *, file: str | None = None, isol
            backend: str = "loky") -> pd.DataFrame:
     """Rerun ``episodes`` of each record, drawn with this ``seed``, and compare the scores.
 
-    ``file`` and ``isolate`` are as of `job_of`; ``replay`` applies recorded actions instead of
+    ``file`` and ``isolate`` as in `job_for_record`; ``replay`` applies recorded actions instead of
     running the policy. Episodes are simulated again. Reruns are stored in ``folder``, where the
     same call resumes.
 
@@ -83,11 +84,12 @@ def verify(paths: Sequence[Path], folder: Path, *, file: str | None = None, isol
     """
     _check.integer("episodes", episodes, low=1)
     rows: list[dict[str, Any]] = []
-    cases: list[Case] = []
+    cases: list[EpisodeCheck] = []
     for path in paths:
         try:
             record = read_record(path)
-            job = None if replay else job_of(record, file, isolate, methods_beside(path))
+            job = None if replay else job_for_record(record, file, isolate,
+                                                     submitted_methods_folder(path))
             if job is not None:
                 job.load()
         except (ValueError, WorkerError) as error:
@@ -97,7 +99,7 @@ def verify(paths: Sequence[Path], folder: Path, *, file: str | None = None, isol
         for k in sorted(drawn):
             episode = record["episodes"][k]
             numbered = job and job._replace(seed=parse_seeds(episode["seed"])[0])
-            cases.append(Case(record, episode, numbered))
+            cases.append(EpisodeCheck(record, episode, numbered))
     with use_cache_dir((folder / "cache").absolute()):
         if replay:
             bar = tqdm(run_parallel(_replayed_row, [(case,) for case in cases], n_jobs, backend),
@@ -106,7 +108,7 @@ def verify(paths: Sequence[Path], folder: Path, *, file: str | None = None, isol
                 bar, key=lambda row: (row["record"], len(row["episode"]), row["episode"]))
         else:
             rows += _rerun_rows(cases, folder, n_jobs, backend)
-    return pd.DataFrame([EMPTY | row for row in rows])
+    return pd.DataFrame([EMPTY_ROW | row for row in rows])
 
 
 def select_records(folder: Path, environments: Sequence[str] = (), *, top: int = 0) -> list[Path]:
@@ -117,14 +119,14 @@ def select_records(folder: Path, environments: Sequence[str] = (), *, top: int =
     error, without naive baselines, oracles and failures. ``ValueError`` if there are none, or
     naming all files that are not valid.
     """
-    read, complaints = read_sound_files(folder)
+    read, complaints = read_valid_files(folder)
     if environments:                        # those of measurements, whose files are rarely there
-        measured, more = read_sound_files(folder, measured=True)
+        measured, more = read_valid_files(folder, measured=True)
         read |= measured
         complaints += more
     if complaints:
         raise ValueError("; ".join(complaints))
-    current = {id(record) for record in newest(list(read.values()))[0]}
+    current = {id(record) for record in split_outdated(list(read.values()))[0]}
     asked = {path: record for path, record in read.items() if id(record) in current
              and (not environments or record["environment"]["id"] in environments)}
     chosen = _first(asked, top) if top else [
@@ -149,12 +151,12 @@ def _first(records: dict[Path, dict[str, Any]], count: int) -> list[Path]:
 # -- the method of a record ---------------------------------------------------------------------
 
 
-def methods_beside(path: Path) -> Path:
+def submitted_methods_folder(path: Path) -> Path:
     """Return the folder of methods that belongs to the folder of a record."""
     return path.absolute().parents[1] / "methods"
 
 
-def job_of(record: dict[str, Any], file: str | None = None, isolate: str = "auto",
+def job_for_record(record: dict[str, Any], file: str | None = None, isolate: str = "auto",
            submitted: Path | None = None) -> Job:
     """Return the job, with seed 0, that a record describes. The method is in ``file``; by default
     the built-in or installed one of that name, or the file with the record's sha256 in the folder
@@ -167,12 +169,12 @@ def job_of(record: dict[str, Any], file: str | None = None, isolate: str = "auto
                          "folder methods beside the records: give it with --method, or replay a "
                          "policy's recorded actions with --replay")
     path = find_method(method, environment.track)
-    built_in = own_files(environment.id).get(record["method"])
-    if is_ours(method) and not (built_in and path.samefile(built_in)):
+    built_in = builtin_files(environment.id).get(record["method"])
+    if is_builtin(method) and not (built_in and path.samefile(built_in)):
         raise ValueError(f"{path} is a built-in method, but not {record['method']}, as the record "
                          "says")
     sha256 = hashlib.sha256(path.read_bytes()).hexdigest()
-    if sha256 != record["method_sha256"] and not is_ours(method):
+    if sha256 != record["method_sha256"] and not is_builtin(method):
         raise ValueError(f"the sha256 of {path.name} is {sha256}, but that of the record "
                          f"{record['method_sha256']}")
     isolation = choose_isolation(environment, method, isolate, strict=True)
@@ -182,7 +184,7 @@ def job_of(record: dict[str, Any], file: str | None = None, isolate: str = "auto
 def _known(record: dict[str, Any]) -> str | None:
     """Return the built-in or installed method of the record's name."""
     name = record["method"]
-    path = (own_files(record["environment"]["id"]) | installed_methods()).get(name)
+    path = (builtin_files(record["environment"]["id"]) | installed_methods()).get(name)
     if path is None:
         return None
     return name if path.suffix == ".py" and name not in installed_methods() else str(path)
@@ -198,21 +200,21 @@ def _submitted(record: dict[str, Any], folder: Path | None) -> str | None:
 
 
 def is_builtin_record(record: dict[str, Any], method: str) -> bool:
-    """Return whether the method of a record's `job_of` is built in; a copy of the checkpoint of a
-    built-in agent is, wherever it lies."""
-    built_in = own_files(record["environment"]["id"]).get(record["method"])
-    return is_ours(method) or (built_in is not None and built_in.suffix == ".zip"
-                               and own_sha256(built_in) == record["method_sha256"])
+    """Return whether ``method``, of a record's `job_for_record`, is built in. A copy of a built-in
+    agent's checkpoint counts as built in."""
+    built_in = builtin_files(record["environment"]["id"]).get(record["method"])
+    return is_builtin(method) or (built_in is not None and built_in.suffix == ".zip"
+                               and builtin_sha256(built_in) == record["method_sha256"])
 
 
 # -- one episode --------------------------------------------------------------------------------
 
 
-def _rerun_rows(cases: list[Case], folder: Path, n_jobs: int, backend: str,
+def _rerun_rows(cases: list[EpisodeCheck], folder: Path, n_jobs: int, backend: str,
                 ) -> list[dict[str, Any]]:
     """Run what the folder does not hold yet, and compare. Each version of a method has its store,
     as third-party methods may share a name; so has each kind of isolation."""
-    found: dict[Path, list[tuple[Case, Job]]] = {}
+    found: dict[Path, list[tuple[EpisodeCheck, Job]]] = {}
     for case in cases:
         if case.job is not None:
             place = folder / case.job.isolation / case.record["version"]
@@ -226,12 +228,12 @@ def _rerun_rows(cases: list[Case], folder: Path, n_jobs: int, backend: str,
     return rows
 
 
-def _rerun_row(case: Case, job: Job, store: EpisodeStore) -> dict[str, Any]:
+def _rerun_row(case: EpisodeCheck, job: Job, store: EpisodeStore) -> dict[str, Any]:
     """Compare a stored rerun with the record."""
     record = case.record
     method = job.load()
     result = store.result(job.environment.name, method.name, job.seed)
-    fields = BUILTIN_FIELDS if is_builtin_record(record, job.method) else (*SHARED, "method")
+    fields = BUILTIN_FIELDS if is_builtin_record(record, job.method) else (*COMMON_FIELDS, "method")
     problems = [f"{name} is {result[name]!r}, but {record[name]!r} in the record"
                 for name in (*fields, "environment") if result[name] != record[name]]
     now, then = version_number(method.version), version_number(record["version"])
@@ -243,29 +245,30 @@ def _rerun_row(case: Case, job: Job, store: EpisodeStore) -> dict[str, Any]:
     return _compared(case, result, job.isolation, problems) | {"note": note}
 
 
-def _replayed_row(case: Case) -> dict[str, Any]:
+def _replayed_row(case: EpisodeCheck) -> dict[str, Any]:
     """Replay an episode and compare it with the record."""
     try:
-        return _compared(case, replayed(case.record, case.episode), "replay", [])
+        return _compared(case, replay_actions(case.record, case.episode), "replay", [])
     except ValueError as error:
         return _compared(case, case.episode, "", [str(error)]) | {"score": "", "rerun": None}
 
 
-def _compared(case: Case, result: dict[str, Any], isolation: str,
+def _compared(case: EpisodeCheck, result: dict[str, Any], isolation: str,
               problems: list[str]) -> dict[str, Any]:
-    differences = differences_of(case.episode, result)
+    differences = score_differences(case.episode, result)
     worst = max(differences, key=lambda name: differences[name], default="")
     if result["status"] != case.episode["status"]:
         problems.append(f"status is {result['status']} ({result.get('message', 'no error')}), but "
                         f"{case.episode['status']} in the record")
     recorded, rerun = (each.get("scores", {}).get("error") for each in (case.episode, result))
-    return {"record": file_name(case.record), "environment": case.record["environment"]["id"],
+    return {"record": record_file_name(case.record),
+            "environment": case.record["environment"]["id"],
             "method": case.record["method"], "episode": case.episode["seed"],
             "isolation": isolation, "score": worst, "difference": differences.get(worst, 0.0),
             "recorded": recorded, "rerun": rerun, "problem": "; ".join(problems)}
 
 
-def replayed(record: dict[str, Any], recorded: dict[str, Any]) -> dict[str, Any]:
+def replay_actions(record: dict[str, Any], recorded: dict[str, Any]) -> dict[str, Any]:
     """Return the result of an episode in which a record's actions are applied without its policy.
     ``ValueError`` if the record has no actions, or the environment rejects them."""
     actions = recorded.get("actions")
@@ -275,7 +278,7 @@ def replayed(record: dict[str, Any], recorded: dict[str, Any]) -> dict[str, Any]
                               json.dumps(record["environment"]["kwargs"]))
     replay = Method("injection", record["method"], record["title"], Path(), "",
                     (record["board"],), {}, lambda *_: _Replay(actions))
-    outcome = play(environment, replay, parse_seeds(recorded["seed"])[0]).outcome
+    outcome = run_method(environment, replay, parse_seeds(recorded["seed"])[0]).outcome
     return {"status": "ok", "scores": scored("injection", outcome),
             "step_errors": outcome.errors.tolist()}
 
@@ -293,7 +296,7 @@ class _Replay:
         raise ValueError("actions must be as many as the episode has steps")
 
 
-def differences_of(recorded: dict[str, Any], result: dict[str, Any]) -> dict[str, float]:
+def score_differences(recorded: dict[str, Any], result: dict[str, Any]) -> dict[str, float]:
     """Return score -> relative difference of two results of an episode, of the reproducible scores
     that the first has, and of the errors of all steps."""
     known = scores()
@@ -320,7 +323,7 @@ def _relative(a: Sequence[float | None], b: Sequence[float | None]) -> float:
 # -- reports ------------------------------------------------------------------------------------
 
 
-def problems_of(rows: pd.DataFrame, tolerance: float = TOLERANCE) -> list[str]:
+def describe_problems(rows: pd.DataFrame, tolerance: float = SCORE_TOLERANCE) -> list[str]:
     """Return a sentence for each episode whose rerun does not agree with its record."""
     sentences = []
     for _, row in rows[_differ(rows, tolerance)].iterrows():
@@ -335,7 +338,7 @@ def _differ(rows: pd.DataFrame, tolerance: float) -> pd.Series:
     return (rows["difference"] > tolerance) | (rows["problem"] != "")
 
 
-def table_of(rows: pd.DataFrame, tolerance: float = TOLERANCE) -> str:
+def verification_table(rows: pd.DataFrame, tolerance: float = SCORE_TOLERANCE) -> str:
     """Return Markdown with a row for each episode; for each environment if they are many."""
     by = ["environment"] if len(rows) > MANY_ROWS else ["record", "episode"]
     lines: list[dict[str, Cell | str]] = []

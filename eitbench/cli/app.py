@@ -40,7 +40,7 @@ def _main(
 @app.command("list")
 def list_() -> None:
     """Show the environments, the baselines and policies, and which boards they play on."""
-    from eitbench.bench.methods import load_method, own_methods
+    from eitbench.bench.methods import builtin_methods, load_method
     from eitbench.bench.tracks import boards_of, ids, measured_ids
     from eitbench.worlds.registry import GROUPS, entry
     from eitbench.worlds.task import lag_steps
@@ -64,7 +64,7 @@ def list_() -> None:
               for name in measured_ids()]
     for track, heading in (("estimation", "baselines"), ("injection", "policies")):
         lines.append((heading, "", ""))
-        methods = {name: load_method(name, track) for name in own_methods(track)}
+        methods = {name: load_method(name, track) for name in builtin_methods(track)}
         lines += [(f"  {name}", ", ".join(method.boards), method.title)
                   for name, method in methods.items()]
     for name, boards, about in lines:
@@ -166,7 +166,7 @@ def leaderboard(
             return report(out)
     from eitbench._files import write_atomically
     from eitbench.bench.episode_table import table_beside, write_episode_table
-    from eitbench.bench.records import read_sound_files
+    from eitbench.bench.records import read_valid_files
     from eitbench.report.boards import read_leaderboard_records
     from eitbench.report.site import collect, render, render_site, write_site
     with options.clear_errors():
@@ -180,7 +180,7 @@ def leaderboard(
         write_atomically(out / name, text.encode())
         options.say(f"wrote {out / name}")
     options.say(f"wrote {out / 'site' / 'index.html'}")
-    write_episode_table(read_sound_files(records)[0].values(), table_beside(records))
+    write_episode_table(read_valid_files(records)[0].values(), table_beside(records))
     options.say(f"wrote {table_beside(records)}")
     for complaint in complaints:
         options.say(f"left out: {complaint}", err=True)

@@ -47,7 +47,7 @@ def estimate(
     """Estimate the concentration in a real tank or pipe: calibrate the vessel, run methods, and
     write a page with estimates, residuals of withheld readings and data-quality warnings."""
     from eitbench.bench.measured import plotted_steps
-    from eitbench.bench.playing import run_on_measurements
+    from eitbench.bench.runner import run_on_measurements
     from eitbench.envs.measured import MeasuredEnv
     from eitbench.measured import read
     from eitbench.measured.segmentation import read_truth, require_round_tank

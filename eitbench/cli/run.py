@@ -59,19 +59,20 @@ def run(
     Exit status 1 if all episodes of a method failed.
     """
     from eitbench.bench import suites
-    from eitbench.bench.run import run_jobs, unplayed
-    from eitbench.bench.store import EpisodeStore, results_in
+    from eitbench.bench.run import pending_jobs, run_jobs
+    from eitbench.bench.store import EpisodeStore, folder_results
     from eitbench.bench.variants import variants
     with options.clear_errors():
         track = _track_of(env or [], baseline, policy)
         if records is not None and not records.is_dir():
             raise ValueError(f"--records must be a folder, got {records}")
         worlds = variants(settings or [])
-        todo = suites.jobs(track, env or [], (baseline or policy or []), options.numbers(seeds),
-                           suite=suite, estimator=estimator, isolate=isolate, worlds=worlds)
-        before = results_in(records) if records else []
+        todo = suites.make_jobs(track, env or [], (baseline or policy or []),
+                                options.numbers(seeds), suite=suite, estimator=estimator,
+                                isolate=isolate, worlds=worlds)
+        before = folder_results(records) if records else []
         store = EpisodeStore(out)
-        left = unplayed(todo, before) if before else todo
+        left = pending_jobs(todo, before) if before else todo
         run_jobs(left, store, n_jobs=jobs, backend=backend, command=typed())
         report(out, todo, worlds, before)
         _end_if_lost(todo, store, before)
@@ -148,8 +149,8 @@ def _say_failures(store: EpisodeStore, records: list[dict[str, Any]],
 def _end_if_lost(asked: Sequence[Job], store: EpisodeStore,
                  before: Sequence[dict[str, Any]] = ()) -> None:
     """Exit status 1 if there is a method that finished none of the episodes it was asked for."""
-    from eitbench.bench.run import successful
-    done = {job.method for job in successful(asked, [*before, *store.results()])}
+    from eitbench.bench.run import successful_results
+    done = {job.method for job in successful_results(asked, [*before, *store.results()])}
     lost = dict.fromkeys(job.load().name for job in asked if job.method not in done)
     if lost:
         options.say(f"no episode was finished by {', '.join(lost)}", err=True)

@@ -91,10 +91,11 @@ def _rerun(paths: list[Path], folder: Path, tolerance: float, episodes: int, see
     from eitbench.bench import verify as verification
     with options.clear_errors():
         rows = verification.verify(paths, folder, episodes=episodes, seed=seed, **how)
-    options.say(f"episodes drawn with --seed {seed}\n\n{verification.table_of(rows, tolerance)}\n")
+    table = verification.verification_table(rows, tolerance)
+    options.say(f"episodes drawn with --seed {seed}\n\n{table}\n")
     for note in dict.fromkeys(filter(None, rows["note"])):
         options.say(f"{note}\n")
-    return verification.problems_of(rows, tolerance)
+    return verification.describe_problems(rows, tolerance)
 
 
 def _held_out(paths: list[Path], folder: Path, method: str | None, isolate: str, secret: bytes,
@@ -106,7 +107,7 @@ def _held_out(paths: list[Path], folder: Path, method: str | None, isolate: str,
     from eitbench.bench.isolation import WorkerError, close
     from eitbench.bench.records import read_record
     from eitbench.bench.table import Table
-    from eitbench.bench.verify import job_of, methods_beside
+    from eitbench.bench.verify import job_for_record, submitted_methods_folder
     from eitbench.data.cache import use_cache_dir
     rows: list[dict[str, Any]] = []
     problems: list[str] = []
@@ -114,7 +115,7 @@ def _held_out(paths: list[Path], folder: Path, method: str | None, isolate: str,
         for path in paths:
             try:
                 record = read_record(path)
-                job = job_of(record, method, isolate, methods_beside(path))
+                job = job_for_record(record, method, isolate, submitted_methods_folder(path))
                 row, found = verify_held_out(record, job, secret, episodes)
             except (ValueError, WorkerError) as error:
                 row, found = {}, [str(error)]

@@ -21,10 +21,10 @@ from eitbench.bench.episode_table import read_episode_table, table_beside
 from eitbench.bench.ranking import shared_ranks
 from eitbench.bench.records import (
     BOARDS,
-    file_name,
-    finished,
-    newest,
-    read_sound_files,
+    finished_at,
+    read_valid_files,
+    record_file_name,
+    split_outdated,
     version_number,
 )
 from eitbench.bench.scores import scores
@@ -251,8 +251,8 @@ def leaderboards(records: list[dict[str, Any]]) -> list[Leaderboard]:
     for record in records:
         if record["split"] != "test":
             raise ValueError("leaderboards are made of test seeds; "
-                             f"{file_name(record)} has {record['split']} seeds")
-    current, _ = newest(records)
+                             f"{record_file_name(record)} has {record['split']} seeds")
+    current, _ = split_outdated(records)
     known = anchors(current)
     found: list[Leaderboard] = []
     for name in CLASSES:
@@ -354,7 +354,7 @@ def _sort_key(row: MethodRow) -> tuple[bool, float, str]:
 def naive_baseline_record(records: Iterable[dict[str, Any]]) -> dict[str, Any] | None:
     """Return the record from which gains are counted, of those of one environment, if any."""
     return max(filter(is_naive_baseline, records), default=None,
-               key=lambda record: (record["official"], finished(record)))
+               key=lambda record: (record["official"], finished_at(record)))
 
 
 def is_naive_baseline(record: dict[str, Any]) -> bool:
@@ -451,7 +451,7 @@ def read_leaderboard_records(folder: Path) -> tuple[list[dict[str, Any]], list[s
     """
     if not folder.is_dir():
         raise ValueError(f"records must be a folder that exists, got {folder}")
-    read, complaints = read_sound_files(folder)
+    read, complaints = read_valid_files(folder)
     complaints += [f"record {path} has {record['split']} seeds, and leaderboards are made of test "
                    "seeds" for path, record in read.items() if record["split"] != "test"]
     found = [record for record in read.values() if record["split"] == "test"]
@@ -474,7 +474,7 @@ def anchors(records: Iterable[dict[str, Any]]) -> Anchors:
         if record["method"] in SKILL_ANCHORS and version_number(record.get("version", "v1")):
             key = (record["method"], world_key(record), record["split"])
             found[key] = max(found.get(key, record), record, key=lambda other: (
-                other["official"], BOARDS.index(other["board"]), finished(other)))
+                other["official"], BOARDS.index(other["board"]), finished_at(other)))
     return {key: scores_by_seed(record, "error") for key, record in found.items()}
 
 

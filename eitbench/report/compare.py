@@ -11,7 +11,13 @@ import pandas as pd
 
 from eitbench import _check
 from eitbench._files import readable, shipped
-from eitbench.bench.records import finished, newest, read_record, read_records, version_number
+from eitbench.bench.records import (
+    finished_at,
+    read_record,
+    read_records,
+    split_outdated,
+    version_number,
+)
 from eitbench.bench.scores import Score, scores
 from eitbench.bench.statistics import (
     Statistic,
@@ -58,7 +64,7 @@ def find_records(name: str, folder: Path) -> list[dict[str, Any]]:
     for place in dict.fromkeys([folder.resolve(), BUNDLED_RECORDS.resolve()]):
         there = read_records(place)
         known |= {record["method"] for record in there}
-        own = [record for record in (there if version else newest(there)[0])
+        own = [record for record in (there if version else split_outdated(there)[0])
                if record["method"] == method and (not version or fits(record["version"]))]
         if not version:
             own = [record for record in own if record["official"]] or own
@@ -114,7 +120,7 @@ def compare(a: list[dict[str, Any]], b: list[dict[str, Any]], score: str = "erro
     both: dict[str, tuple[dict[str, float], dict[str, float]]] = {}
     gains: dict[str, dict[str, Any]] = {kind: {} for kind in CLASSES}
     levels = {_environment_and_split(record): scores_by_seed(record, "error") for record in
-              sorted(zero, key=lambda record: (record["official"], finished(record)))}
+              sorted(zero, key=lambda record: (record["official"], finished_at(record)))}
     for record in sorted(a, key=_environment_and_split):
         place = name, split = _environment_and_split(record)
         pair = scores_by_seed(record, score), theirs.get(place, {})

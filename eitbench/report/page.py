@@ -16,7 +16,7 @@ from PIL import Image
 
 from eitbench._files import write_atomically
 from eitbench._foreign import cleaned
-from eitbench.bench.records import alike
+from eitbench.bench.records import group_runs
 from eitbench.bench.store import EpisodeStore
 from eitbench.bench.text import seed_ranges
 from eitbench.bench.tracks import Environment
@@ -52,7 +52,7 @@ def write_page(store: EpisodeStore, boards: Sequence[Leaderboard],
         sweeps=[(sweep, sweep.chart()) for sweep in sweeps],
         colour_bar=_draw_bare(3.0, 0.12, lambda axes: axes.imshow(
             np.linspace(0, 1, 256)[None], cmap=FIELD_COLORMAP, aspect="auto")),
-        runs=[group[0] for group in alike(runs, "command")])
+        runs=[group[0] for group in group_runs(runs, "command")])
     path = store.folder / "index.html"
     write_atomically(path, html)
     return path

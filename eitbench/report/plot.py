@@ -14,7 +14,7 @@ from tqdm import tqdm
 
 from eitbench import _check, scoring
 from eitbench.bench.evaluation import environment_of, method_given
-from eitbench.bench.playing import can_play, estimates, injections
+from eitbench.bench.runner import is_compatible, iter_estimates, iter_injections
 from eitbench.bench.scores import scores
 from eitbench.bench.text import mean_and_interval
 from eitbench.data.episode_cache import region_operators
@@ -92,7 +92,7 @@ def episode(method: Any, env: str | gym.Env, seed: int | str, *,
     loaded = method_given(method, asked.track)
     number = parse_single_seed(seed)
     made = asked.make()
-    if not can_play(loaded, made):
+    if not is_compatible(loaded, made):
         raise ValueError(f"method {loaded.name} does not play {asked.id}")
     world_of = made.world
     _check.integer("times", times, low=1, high=world_of.schedule.scored_steps)
@@ -194,8 +194,9 @@ def parse_single_seed(seed: int | str) -> int:
 
 
 def run_until(env: Any, method: Any, seed: int, last: int) -> Iterator[Any]:
-    """Yield what `estimates` or `injections` yields up to the state t = ``last``."""
-    states = (injections if isinstance(env, InjectionEnv) else estimates)(env, method, seed)
+    """Yield what `iter_estimates` or `iter_injections` yields up to the state t = ``last``."""
+    steps = iter_injections if isinstance(env, InjectionEnv) else iter_estimates
+    states = steps(env, method, seed)
     for state in tqdm(states, total=last, desc="playing", unit="state", disable=None):
         yield state
         if state[0] == last:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from eitbench.bench.run import Job, successful
+from eitbench.bench.run import Job, successful_results
 from eitbench.bench.scores import scores
 from eitbench.bench.statistics import FEWEST, stratified_bootstrap
 from eitbench.report.tables import agent_name
@@ -23,7 +23,7 @@ def policy_rows(jobs: Sequence[Job], results: Iterable[dict[str, Any]]) -> pd.Da
     """Return one row for each job that succeeded according to ``results``: policy, seed, and every
     score of injection boards, in its own unit."""
     rows = [{"policy": result["method"], "seed": result["seed"], **result["scores"]}
-            for result in successful(jobs, results).values()]
+            for result in successful_results(jobs, results).values()]
     return pd.DataFrame(rows, columns=["policy", "seed", *scores("injection")])
 
 

@@ -16,7 +16,7 @@ from tqdm import tqdm
 
 from eitbench import scoring
 from eitbench.bench.methods import load_method
-from eitbench.bench.playing import estimates
+from eitbench.bench.runner import iter_estimates
 from eitbench.data.episode_cache import score_operators
 from eitbench.envs.estimation import EstimationEnv
 from eitbench.envs.rendering import STD_COLORMAP, colour_range, draw_electrodes, draw_field
@@ -30,7 +30,7 @@ INK, GREY, ACCENT = "#0b6e75", "0.35", "#d1495b"
 
 def run_baseline(env: EstimationEnv, baseline: str, seed: int) -> list[Estimate]:
     """Return the estimates of a baseline for t = 1 … T."""
-    steps = estimates(env, load_method(baseline, "estimation"), seed)
+    steps = iter_estimates(env, load_method(baseline, "estimation"), seed)
     with threadpool_limits(1):
         return [estimate for _, estimate in tqdm(steps, total=env.task.n_steps, desc=baseline,
                                                  unit="state", disable=None, leave=False)]

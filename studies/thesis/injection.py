@@ -13,8 +13,8 @@ from matplotlib.lines import Line2D
 
 from eitbench._files import shipped
 from eitbench.bench.methods import baseline_folder
-from eitbench.bench.run import run_jobs, unplayed
-from eitbench.bench.store import EpisodeStore, results_in
+from eitbench.bench.run import pending_jobs, run_jobs
+from eitbench.bench.store import EpisodeStore, folder_results
 from eitbench.bench.suites import jobs as jobs_of
 from eitbench.bench.text import mean_and_interval
 from eitbench.data.seeds import format_seed
@@ -47,13 +47,13 @@ def injection(seeds: list[int] | None, jobs: int, out: Path) -> tuple[Path, str]
     minutes.
     """
     store = EpisodeStore(out)
-    recorded = results_in(shipped("leaderboards") / "results")
+    recorded = folder_results(shipped("leaderboards") / "results")
     figure = Figure(figsize=(13.5, 13.8), dpi=110, layout="constrained")
     panels = figure.subplots(3, 3, height_ratios=(4, 4, 3))
     tables = []
     for (env, title), axes in zip(WORLDS.items(), panels[:2].flat, strict=True):
         todo = jobs_of("injection", [env], [], seeds)
-        run_jobs(unplayed(todo, recorded), store, n_jobs=jobs,
+        run_jobs(pending_jobs(todo, recorded), store, n_jobs=jobs,
                  command="python studies/thesis injection")
         rows = policy_rows(todo, [*recorded, *store.results()])
         privileged = sorted({job.load().name for job in todo if job.load().privileged})

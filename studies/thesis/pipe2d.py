@@ -11,7 +11,7 @@ from threadpoolctl import threadpool_limits
 
 from eitbench import scoring
 from eitbench.bench.methods import load_method
-from eitbench.bench.playing import estimated
+from eitbench.bench.runner import run_estimator
 from eitbench.bench.scores import scored
 from eitbench.data.episode_cache import score_operators
 from eitbench.envs.estimation import EstimationEnv
@@ -162,7 +162,7 @@ def _filter_scores(velocity: float, seeds: list[int]) -> list[dict[str, float]]:
     env = _env(mean_velocity=float(velocity))
     with threadpool_limits(1):
         kalman_filter = load_method("kalman_filter", "estimation")
-        return [scored("estimation", estimated(env, kalman_filter, seed).outcome)
+        return [scored("estimation", run_estimator(env, kalman_filter, seed).outcome)
                 for seed in seeds]
 
 

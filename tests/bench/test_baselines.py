@@ -5,19 +5,20 @@ import os
 import re
 
 import pytest
-from eitbench.bench.methods import MOST_BYTES, is_ours, load_method, own_methods
+from eitbench.bench.methods import MAX_METHOD_BYTES, builtin_methods, is_builtin, load_method
 
 from tiny import strict
 
 
 def test_our_baselines_load():
     """Each of ours has a title, a board, a hash, and parameters that JSON can hold."""
-    assert {"homogeneous", "kalman_filter", "fixed_interval_smoother", "gauss_newton"} <= set(own_methods("estimation"))
-    for name in own_methods("estimation"):
+    assert {"homogeneous", "kalman_filter", "fixed_interval_smoother", "gauss_newton"} <= {
+        *builtin_methods("estimation")}
+    for name in builtin_methods("estimation"):
         baseline = load_method(name, "estimation")
         assert baseline.name == name and baseline.title and baseline.boards and len(baseline.sha256) == 64
         assert strict(json.dumps(baseline.parameters)) == baseline.parameters
-    ours = [load_method(name, track) for track in ("estimation", "injection") for name in own_methods(track)]
+    ours = [load_method(name, track) for track in ("estimation", "injection") for name in builtin_methods(track)]
     roles = {method.name: method.role for method in ours if method.role}
     assert roles == {"homogeneous": "floor", "persistence": "floor", "true_model_smoother": "reference",
                      "clairvoyant": "reference", "random_pair": "floor"}
@@ -53,7 +54,7 @@ def test_unknown_baselines(tmp_path):
     """A name that is none of ours: the message lists ours. A file that is too large is not read."""
     path = tmp_path / "mine.py"
     path.touch()
-    os.truncate(path, MOST_BYTES + 1)
+    os.truncate(path, MAX_METHOD_BYTES + 1)
     with pytest.raises(ValueError, match="must have 256 MiB at most"):
         load_method(str(path), "estimation")
     for name in ("kalman", "no/such/file.py", ""):
@@ -84,18 +85,18 @@ def test_baselines_may_use_dataclasses(tmp_path):
 def test_only_registered_names_are_ours(track, tmp_path, monkeypatch):
     """A path without .py leads nowhere, be there a file of that name with it; a link is what it
     leads to; a name of ours in another folder is refused."""
-    ours = own_methods(track)[0]
+    ours = builtin_methods(track)[0]
     path = tmp_path / "insider.py"
     path.write_text("raise SystemExit('executed')")
     monkeypatch.chdir(tmp_path)
     for name in (str(tmp_path / "insider"), "insider", "./insider", f"../{tmp_path.name}/insider",
                  f"{ours}/../../insider", "", "."):
-        assert not is_ours(name)
+        assert not is_builtin(name)
         with pytest.raises(ValueError, match=f"or one of .*; got {re.escape(repr(name))}"):
             load_method(name, track)
-    assert is_ours(ours) and not is_ours(str(path))
+    assert is_builtin(ours) and not is_builtin(str(path))
     link = tmp_path / f"{ours}.py"
     link.symlink_to(path)
-    assert not is_ours(str(link))
+    assert not is_builtin(str(link))
     with pytest.raises(ValueError, match="has the name of one of ours"):
         load_method(str(link), track)

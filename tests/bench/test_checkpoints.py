@@ -8,14 +8,14 @@ import zipfile
 import numpy as np
 import pytest
 from eitbench.bench import isolation
-from eitbench.bench.methods import baseline_folder, load_method, own_agents
+from eitbench.bench.methods import baseline_folder, builtin_agents, load_method
 from eitbench.bench.run import Job, run_episode
 from eitbench.bench.tracks import Environment, ids
 
 from injection_envs import injected
 
 FOLDER = baseline_folder() / "checkpoints"
-AGENTS = [path for env in ids("injection") for path in own_agents(env)]
+AGENTS = [path for env in ids("injection") for path in builtin_agents(env)]
 FIRST = 100_000
 """The first dev episode, with which evaluations begin."""
 

@@ -8,7 +8,7 @@ import pytest
 from eitbench._files import shipped
 from eitbench.bench import load
 from eitbench.bench.episode_table import NAME, episode_table, read_episode_table, write_episode_table
-from eitbench.bench.records import newest, read_records, write_record
+from eitbench.bench.records import read_records, split_outdated, write_record
 from eitbench.report import compare
 from eitbench.report.boards import anchors, bundled_anchors
 
@@ -43,7 +43,7 @@ def test_records_come_back(tmp_path):
         for one, other in zip(made["episodes"], found["episodes"], strict=True):
             assert all(other[name] == one[name] for name in other)
             assert ("scores" in one) == ("scores" in other)
-    assert [len(group) for group in newest(read)] == [len(group) for group in newest(written)]
+    assert [len(group) for group in split_outdated(read)] == [len(group) for group in split_outdated(written)]
     for each in written:
         write_record(tmp_path / "json", each)
     listed, order = load(tmp_path / "results"), ["environment", "method", "version", "seed", "metric"]

@@ -18,7 +18,7 @@ from commands import eitbench
 IDS = own_ids()
 FLUIDS = list(dict.fromkeys(entry(id).world.truth_config for id in IDS))
 BY_FLUID = sorted(IDS, key=lambda id: FLUIDS.index(entry(id).world.truth_config))
-METHODS = golden.official_methods()
+METHODS = golden.golden_methods()
 BY_ENVIRONMENT = sorted(METHODS, key=lambda name: str((golden.read_golden(name) or {}).get("episodes")))
 SLOW = ("filter_bank", "eitbench-Pipe2DInjectionFlow-v0--ppo")
 """Methods whose short episodes take half a minute."""
@@ -62,7 +62,7 @@ def test_every_id_and_method_has_its_golden_file_and_nothing_else_has():
 
 def test_versions_of_built_in_methods_are_those_of_their_golden_files(monkeypatch, tmp_path):
     """A third-party file has eight digits of its hash as version, whatever its name."""
-    monkeypatch.setattr(methods, "card_version", {"homogeneous": 3, "adjacent": 2}.get)
+    monkeypatch.setattr(methods, "golden_version", {"homogeneous": 3, "adjacent": 2}.get)
     assert methods.load_method("homogeneous", "estimation").version == "v3"
     assert methods.load_method("adjacent", "injection").version == "v2"
     own = tmp_path / "own.py"
@@ -126,7 +126,7 @@ def moved(by):
     (lambda made: made["model"].update(step=["fast"] * 5), "model.step is ["),
     (lambda made: made["model"].update(step=[None] * 5), "model.step"),
     (lambda made: made["episodes"].update({"dev:0": []}), "episodes.dev:0 is"),
-    (moved(0.01), "episodes.dev:0.voltages differs by 0.01 of its largest"), (moved(0.5 * golden.DOUBLE), "")])
+    (moved(0.01), "episodes.dev:0.voltages differs by 0.01 of its largest"), (moved(0.5 * golden.RTOL_FLOAT64), "")])
 def test_difference_is_reported(change, message, copy):
     """The number, name or kind that differs; not a difference within the tolerance."""
     content = golden.read_golden(PLAIN)

@@ -26,7 +26,7 @@ from eitbench.bench.isolation import (
     choose_isolation,
     decode_message,
     encode_message,
-    readable_places,
+    readable_paths,
 )
 from eitbench.bench.run import Job, run_episode, run_jobs
 from eitbench.bench.store import EpisodeStore
@@ -170,7 +170,7 @@ def test_third_party_files_need_bubblewrap_where_strict(monkeypatch):
     with pytest.raises(ValueError, match="isolate must be bubblewrap or process"):
         choose_isolation(FILTER, "mine.py", "none", strict=True)
     with pytest.raises(ValueError, match="isolate must be one of auto, none, process, bubblewrap, got 'never'"):
-        suites.jobs("estimation", [FILTER.id], ["homogeneous"], [1], isolate="never")
+        suites.make_jobs("estimation", [FILTER.id], ["homogeneous"], [1], isolate="never")
 
 
 def test_a_kernel_that_forbids_namespaces_is_recognised(monkeypatch, tmp_path):
@@ -370,7 +370,7 @@ def test_a_question_that_is_not_read_times_out(tmp_path):
 
 def test_secrets_must_lie_elsewhere_than_python():
     """Neither a cache with truths nor a maintainer's secret where workers read."""
-    place = next(place for place in readable_places() if place.is_dir() and "packages" in place.name)
+    place = next(place for place in readable_paths() if place.is_dir() and "packages" in place.name)
     with pytest.raises(ValueError, match=r"the cache folder .* must lie outside .*, which isolated methods can read"):
         check_out_of_reach(place / "cache", "the cache folder")
     check_out_of_reach(ROOT / "leaderboards" / "held_out.json", "a record")

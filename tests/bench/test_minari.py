@@ -44,12 +44,12 @@ def test_replaying_gives_the_same_again():
 def test_its_policy_is_the_one_that_is_scored():
     """The same draws: injections are those of `eitbench run`."""
     from eitbench.bench.methods import load_method
-    from eitbench.bench.playing import injections
+    from eitbench.bench.runner import iter_injections
     export_minari(NAME, ENV, "random_pair", "dev:3")
     (episode,) = minari.load_dataset(NAME).iterate_episodes()
     env = gym.make(ENV, estimator="full", observation="raw").unwrapped
     played = [observation["currents"] for _, observation, _ in
-              injections(env, load_method("random_pair", "injection"), 100_003)]
+              iter_injections(env, load_method("random_pair", "injection"), 100_003)]
     np.testing.assert_allclose(played, env.rules.currents(episode.actions))
 
 

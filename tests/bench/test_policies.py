@@ -5,8 +5,8 @@ import json
 import numpy as np
 import pandas as pd
 import pytest
-from eitbench.bench import playing, run
-from eitbench.bench.methods import load_method, own_methods
+from eitbench.bench import run, runner
+from eitbench.bench.methods import builtin_methods, load_method
 from eitbench.bench.run import Job, run_jobs
 from eitbench.bench.store import EpisodeStore
 from eitbench.bench.tracks import Environment
@@ -34,7 +34,7 @@ SEED = 5
 
 
 def environment(name: str) -> InjectionEnv:
-    return playing.environment(
+    return runner.cached_environment(
         Environment(name, json.dumps(KWARGS[name] | {"estimator": "reduced"})))
 
 
@@ -169,7 +169,7 @@ def test_an_even_budget_is_spent_exactly(budget):
 
 
 @pytest.mark.parametrize("name", list(KWARGS))
-@pytest.mark.parametrize("policy", own_methods("injection"))
+@pytest.mark.parametrize("policy", builtin_methods("injection"))
 def test_policies_play_what_they_suit(policy, name, monkeypatch):
     """Valid actions, reproducible to the bit, within the budget; what does not suit is refused."""
     env = environment(name)
@@ -186,7 +186,7 @@ def test_policies_play_what_they_suit(policy, name, monkeypatch):
 def test_scores_are_those_of_the_exact_filter():
     """The mean error under the full estimator is that of its own estimates, step by step."""
     played = injected(NAME, SHORT, "best_pair", SEED)
-    env = playing.environment(Environment(NAME, json.dumps(SHORT | {"estimator": "full"})))
+    env = runner.cached_environment(Environment(NAME, json.dumps(SHORT | {"estimator": "full"})))
     env.reset(seed=SEED)
     errors = []
     for _ in range(env.core.length):
@@ -219,7 +219,7 @@ def test_played_episodes_are_kept(tmp_path, monkeypatch):
 
     next(store.folder.glob("episodes/*/opposite/dev-1.json")).write_text("{")
     again = []
-    monkeypatch.setattr(run, "play", lambda *asked: again.append(asked) or playing.play(*asked))
+    monkeypatch.setattr(run, "run_method", lambda *asked: again.append(asked) or runner.run_method(*asked))
     run_jobs(todo, store)
     pd.testing.assert_frame_equal(policy_rows(todo, store.results()).drop(columns="seconds_per_step"),
                                   rows.drop(columns="seconds_per_step"))

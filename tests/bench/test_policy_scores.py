@@ -6,11 +6,11 @@ import eitbench
 import numpy as np
 import pytest
 from eitbench import scoring
-from eitbench.bench import playing
+from eitbench.bench import runner
 from eitbench.bench.methods import load_method
 from eitbench.bench.scores import Outcome, scored
 from eitbench.bench.tracks import Environment
-from eitbench.bench.verify import differences_of
+from eitbench.bench.verify import score_differences
 from eitbench.data.episode_cache import mass_between
 from eitbench.numerics.fem import mass_matrix
 from eitbench.worlds import entry
@@ -47,7 +47,7 @@ def again(name: str, currents: np.ndarray) -> dict[str, list]:
 def test_claims_are_those_of_the_filter_inside(name):
     """CRPS, coverage and var/MSE are the formulas' of mean, spread and truth on the truth's nodes
     within what counts; NIS/m is the mean over the injections of which a reading was used."""
-    played = playing.play(
+    played = runner.run_method(
         Environment(name, json.dumps({"world": world(name), "estimator": "reduced"})),
         load_method("random_pair", "injection"), SEED)
     seen = again(name, played.currents)
@@ -96,8 +96,8 @@ def test_a_record_from_before_is_the_same():
     wrong number is one."""
     said = {"status": "ok", "step_errors": [0.1], "scores": {"error": 0.1, "spent": 3}}
     now = said | {"scores": said["scores"] | {"nis": 1.2, "crps": 0.4}}
-    assert set(differences_of(said, now)) == {"error", "spent", "step_errors"}
-    assert not any(differences_of(said, now).values())
+    assert set(score_differences(said, now)) == {"error", "spent", "step_errors"}
+    assert not any(score_differences(said, now).values())
     wrong = now | {"scores": now["scores"] | {"nis": 1.3}}
-    assert differences_of(wrong, now)["nis"] == pytest.approx(0.1 / 1.3)
-    assert differences_of(now, said)["nis"] == np.inf
+    assert score_differences(wrong, now)["nis"] == pytest.approx(0.1 / 1.3)
+    assert score_differences(now, said)["nis"] == np.inf

@@ -14,12 +14,12 @@ from eitbench.bench.records import (
     BOARDS,
     MAX_BYTES,
     MAX_DEPTH,
-    file_name,
-    newest,
     read_record,
     read_records,
+    record_file_name,
     schema_text,
-    sealed,
+    split_outdated,
+    with_content_hash,
     write_record,
 )
 from eitbench.bench.tracks import ARGUMENTS, boards_of, named
@@ -49,7 +49,7 @@ def changed(path, value, whole=MINE):
 def write_unchecked(folder, content, name=None):
     """A file as somebody might leave it."""
     folder.mkdir(exist_ok=True)
-    path = folder / (name or file_name(content))
+    path = folder / (name or record_file_name(content))
     path.write_text(json.dumps(content))
     return path
 
@@ -147,7 +147,7 @@ def test_violations_are_named(path, value, message, tmp_path):
     with pytest.raises(ValueError, match=message):
         write_record(tmp_path / "new", wrong)
     assert not (tmp_path / "new").exists()
-    file = write_unchecked(tmp_path, sealed(wrong), "it.json")
+    file = write_unchecked(tmp_path, with_content_hash(wrong), "it.json")
     with pytest.raises(ValueError, match=message) as caught:
         read_records(tmp_path)
     assert str(file) in str(caught.value)
@@ -193,7 +193,7 @@ def test_a_file_has_its_content_s_name(tmp_path):
     """Nobody replaces a record by a file of another name, or has two of one thing."""
     path = write_record(tmp_path, MINE)
     path.rename(tmp_path / path.name.replace("mine", "yours"))
-    with pytest.raises(ValueError, match=f"must have the name {file_name(MINE)}"):
+    with pytest.raises(ValueError, match=f"must have the name {record_file_name(MINE)}"):
         read_records(tmp_path)
 
 
@@ -221,10 +221,10 @@ def test_only_the_highest_version_of_a_method_of_ours_is_current():
     tank = record("a", [0.1], id="eitbench/RotatingTank2D-v0", version="v1")
     dev = record("a", {"dev:0": 0.1}, version="v1")
     other = record("b", [0.1], version="v1", runs=[RUN | {"source": sha("other")}])
-    assert newest([v2, tank, v10, dev, other]) == ([tank, v10, dev, other], [v2])
-    assert newest([]) == ([], [])
+    assert split_outdated([v2, tank, v10, dev, other]) == ([tank, v10, dev, other], [v2])
+    assert split_outdated([]) == ([], [])
     both = [record("mine", [0.1], version=version, finished=f"2025-01-0{version}") for version in "12"]
-    assert newest(both) == (both, [])                         # digits of a sha256 do not say which came first
+    assert split_outdated(both) == (both, [])                         # digits of a sha256 do not say which came first
 
 
 # -- the schema -------------------------------------------------------------------------------------------------------
@@ -309,7 +309,7 @@ def test_what_json_lacks_is_named_with_the_file(text, place, tmp_path):
 @pytest.mark.parametrize("field", ["checkpoint_sha256", "version", "method_sha256"])
 def test_a_pattern_ends_where_the_text_does(field, tmp_path):
     """Python's $ also stands before a last newline."""
-    made = sealed(MINE | {field: (MINE[field] or "a" * 64) + "\n"})
+    made = with_content_hash(MINE | {field: (MINE[field] or "a" * 64) + "\n"})
     with pytest.raises(ValueError, match="is not valid"):
         read_record(write_unchecked(tmp_path, made, "it.json"))
 

@@ -8,11 +8,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from eitbench.bench import playing
+from eitbench.bench import runner
 from eitbench.bench.methods import Method
-from eitbench.bench.outcomes import Said
-from eitbench.bench.playing import estimated
+from eitbench.bench.outcomes import EstimatorOutput
 from eitbench.bench.run import Job, run_episode, run_jobs
+from eitbench.bench.runner import run_estimator
 from eitbench.bench.store import EpisodeStore
 from eitbench.bench.tracks import Environment, board_of
 from eitbench.data.cache import CACHE_VARIABLE
@@ -119,7 +119,7 @@ def test_estimators_see_the_task_and_measurements_only(environment):
         seen.append(arguments)
         return Estimate(np.full(1701, 30.0))
 
-    estimated(env, baseline_of(update), 3)
+    run_estimator(env, baseline_of(update), 3)
     assert len(seen) == env.task.n_steps + env.task.lag
     observation, _ = env.reset(seed=3)
     for task, _, *measurement in seen:
@@ -179,7 +179,7 @@ def test_estimators_cannot_spoil_the_task_for_others(tmp_path):
     try:
         assert scores_of(run_episode(Job(FILTER, good, 1))[0]) == before
     finally:
-        forget_made(playing)                                    # what a vandal broke is no other test's affair
+        forget_made(runner)                                    # what a vandal broke is no other test's affair
 
 
 @pytest.mark.parametrize(("environment", "board"), [(FILTER, "filter"), (FIXED_LAG, "fixed-lag"),
@@ -192,7 +192,7 @@ def test_estimates_are_taken_for_the_state_that_was_asked_for(environment, board
     def update(task, i, *_):
         return Estimate(np.full(1701, 20.0 + i - task.lag)) if i > task.lag else None
 
-    played = Said.collect(env.task, playing._estimates(env, baseline_of(update), 3))
+    played = EstimatorOutput.collect(env.task, runner._iter_steps(env, baseline_of(update), 3))
     np.testing.assert_array_equal(played.means, np.repeat(20.0 + np.arange(1, 6)[:, None], 1701, axis=1))
     assert played.voltages.shape == played.currents.shape == (5, 4) and len(played.seconds) == 5 + env.task.lag
 

@@ -14,7 +14,7 @@ import pytest
 from eitbench.bench import store as store_module
 from eitbench.bench.run import Job, run_jobs
 from eitbench.bench.scores import SCORING
-from eitbench.bench.store import EpisodeStore, machine, portable_command, provenance, results_of
+from eitbench.bench.store import EpisodeStore, machine, portable_command, provenance, record_results
 from eitbench.bench.tracks import Environment
 from eitbench.data.cache import CACHE_VARIABLE
 from eitbench.data.seeds import format_seed
@@ -77,11 +77,11 @@ def test_only_a_success_of_the_same_identity_is_held(store):
     """What failed, was made by other code, or belongs to another seed counts as not done."""
     put(store, result())
     put(store, failed(2))
-    assert store.holds(ENV, "mine", 1, "abc")
-    assert not store.holds(ENV, "mine", 1, "abd")
-    assert not store.holds(ENV, "mine", 2, "abc")
-    assert not store.holds(ENV, "mine", 3, "abc")
-    assert not store.holds(ENV, "yours", 1, "abc")
+    assert store.has_result(ENV, "mine", 1, "abc")
+    assert not store.has_result(ENV, "mine", 1, "abd")
+    assert not store.has_result(ENV, "mine", 2, "abc")
+    assert not store.has_result(ENV, "mine", 3, "abc")
+    assert not store.has_result(ENV, "yours", 1, "abc")
 
 
 @pytest.mark.parametrize("number", [math.nan, math.inf, -math.inf])
@@ -259,7 +259,7 @@ def test_other_results_fill_what_is_missing_or_failed(store):
     assert [(row["seed"], row["seconds"]) for row in record["episodes"]] == [
         ("train:1", 2.0), ("train:2", 3.0), ("train:3", 4.0)]
     assert [record["runs"][row["run"]]["source"] for row in record["episodes"]] == [sha("code")] * 2 + [sha("older")]
-    (same,) = EpisodeStore(store.folder / "empty").records(also=results_of(record))
+    (same,) = EpisodeStore(store.folder / "empty").records(also=record_results(record))
     assert same == record
 
 

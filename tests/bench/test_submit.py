@@ -5,7 +5,7 @@ import re
 import pytest
 from eitbench.bench import load, methods, run, suites
 from eitbench.bench import store as store_module
-from eitbench.bench.records import newest, read_record, read_records, write_record
+from eitbench.bench.records import read_record, read_records, split_outdated, write_record
 from eitbench.bench.store import EpisodeStore, provenance
 from eitbench.bench.submit import submit
 from eitbench.data.seeds import parse_seeds
@@ -47,8 +47,8 @@ def test_all_of_ours_by_one_command(tmp_path, monkeypatch):
     """Those that play, environment after environment: what is done has its record when a later one is interrupted."""
     ours = {"estimation": ["homogeneous", "fixed_interval_smoother"],
             "injection": ["random_pair", "event_triggered"]}
-    monkeypatch.setattr(suites, "own_methods", ours.get)
-    monkeypatch.setattr(suites, "own_agents", lambda id: [])
+    monkeypatch.setattr(suites, "builtin_methods", ours.get)
+    monkeypatch.setattr(suites, "builtin_agents", lambda id: [])
     made = submit(None, [FILTER.id, INJECTION], TEST[:1], EpisodeStore(tmp_path / "r"), tmp_path / "to")
     assert "--homogeneous--" in next(made).name
     assert [path.name.split("--")[1] for path in (tmp_path / "to").iterdir()] == ["homogeneous"]
@@ -146,10 +146,10 @@ def test_what_says_more_is_not_replaced(tmp_path, monkeypatch):
     with pytest.raises(ValueError, match="would lose its being official"):
         submitted("b", TEST[:1])
     with monkeypatch.context() as patch:
-        patch.setattr(methods, "card_version", lambda name: 2)
+        patch.setattr(methods, "golden_version", lambda name: 2)
         assert submitted("b", TEST[:1])["seeds"] == ["test:0"]
     newer = read_record(path.with_name(path.name.replace("v1", "v2")))
-    assert newest(read_records(to)) == ([read_record(path), newer], [])         # only an official one makes it outdated
+    assert split_outdated(read_records(to)) == ([read_record(path), newer], [])  # an official record stays current
 
 
 def test_a_record_of_another_scoring_is_extended(tmp_path, monkeypatch):

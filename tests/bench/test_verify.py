@@ -164,7 +164,7 @@ def test_another_file_does_not_run(mine, tmp_path):
     link.parent.mkdir()
     link.symlink_to(methods.find_method("homogeneous", "estimation"))
     with pytest.raises(ValueError, match="is a built-in method, but not mine"):
-        verification.job_of(read_record(path), str(link))
+        verification.job_for_record(read_record(path), str(link))
 
 
 def test_numbers_decide_and_not_the_text(monkeypatch):

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 from eitbench import __version__
 from eitbench.bench import suites, tracks
-from eitbench.bench.methods import own_methods
+from eitbench.bench.methods import builtin_methods
 from eitbench.bench.tracks import ids
 from eitbench.cli.app import app
 from eitbench.data.seeds import parse_seeds
@@ -101,18 +101,18 @@ def test_every_board_by_default(tmp_path):
 def test_suites():
     """full is every environment; quick the plain pipe on fewer seeds, but for the one method that takes minutes.
     What was learned in a real pipe plays no tiny one."""
-    quick, full = (suites.jobs("estimation", [], [], [1], suite=suite) for suite in ("quick", "full"))
+    quick, full = (suites.make_jobs("estimation", [], [], [1], suite=suite) for suite in ("quick", "full"))
     plain = set(PLAIN) & set(ids("estimation"))
     assert {job.environment.id for job in quick} == plain and len(plain) == 3
     assert {job.environment.id for job in full} == set(ids("estimation"))
     real_only = {"approximation_error_filter", "identified_flow", "real_time_filter"}
-    real_only |= {name for name in own_methods("estimation") if name.startswith("learned_")}
+    real_only |= {name for name in builtin_methods("estimation") if name.startswith("learned_")}
     missing = {job for job in full if job.environment.id in plain} - set(quick)
     assert missing == {suites.Job(suites.Environment(PIPE), "gauss_newton", 1)} and set(quick) < set(full)
-    assert {job.method for job in full} == set(own_methods("estimation")) - real_only
+    assert {job.method for job in full} == set(builtin_methods("estimation")) - real_only
     assert set(parse_seeds(tracks.QUICK_SEEDS)) < set(parse_seeds(entry(PIPE).test_seeds))
     assert min(parse_seeds(entry(PIPE).test_seeds)) == 200_000
-    asked_for = suites.jobs("estimation", [PIPE], ["gauss_newton"], [1, 2], suite="quick")
+    asked_for = suites.make_jobs("estimation", [PIPE], ["gauss_newton"], [1, 2], suite="quick")
     assert [job.seed for job in asked_for] == [1, 2]
 
 
@@ -124,7 +124,7 @@ def test_list():
     code, said, _ = eitbench("list")
     assert code == 0
     lines = {line.split()[0]: line for line in said.splitlines()}
-    assert lines.keys() >= {*ids(), *own_methods("estimation"), *own_methods("injection")}
+    assert lines.keys() >= {*ids(), *builtin_methods("estimation"), *builtin_methods("injection")}
     assert "injection" in lines["random_pair"] and "Random pair" in lines["random_pair"]
     assert "smoothing" in lines["eitbench/Pipe2DSmoothing-v0"] and "3 scored of 5" in lines[PIPE]
     assert lines["eitbench/Pipe3D-v0"].endswith("starting point")

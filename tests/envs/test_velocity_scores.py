@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from eitbench import Estimate
-from eitbench.bench.playing import estimated
+from eitbench.bench.runner import run_estimator
 from eitbench.bench.scores import scored
 from estimation_envs import PIPE, SKEWED, VELOCITY, make
 
@@ -31,7 +31,7 @@ def test_leaderboard_scores_what_is_rewarded(name, said, monkeypatch):
 
     monkeypatch.setattr(base, "step", watched)
     baseline = SimpleNamespace(make=lambda _: estimator, privileged=False)
-    scores = scored("estimation", estimated(base, baseline, 1).outcome)
+    scores = scored("estimation", run_estimator(base, baseline, 1).outcome)
     rewards = np.array([reward for _, (_, reward, *_) in played])[task.warm_up:]
     total = scores["error"] + scores["velocity_error"]
     assert total == pytest.approx(-rewards.mean(), abs=1e-7)
@@ -52,4 +52,4 @@ def test_flow_is_refused_where_it_is_not_asked_for(id, message):
     estimator = SimpleNamespace(update=lambda *_: said)
     baseline = SimpleNamespace(make=lambda _: estimator, privileged=False)
     with pytest.raises(ValueError, match=message):
-        estimated(base, baseline, 1)
+        run_estimator(base, baseline, 1)

@@ -7,9 +7,9 @@ import zipfile
 from pathlib import Path
 
 import pytest
-from eitbench.bench.methods import own_files
+from eitbench.bench.methods import builtin_files
 from eitbench.bench.records import read_record
-from eitbench.bench.verify import is_builtin_record, job_of
+from eitbench.bench.verify import is_builtin_record, job_for_record
 from eitbench.cli.app import app
 from typer.main import get_command
 
@@ -106,7 +106,7 @@ def test_an_agent_s_record_asks_for_its_model(installed, empty, tmp_path):
     said = installed("-m", "eitbench.cli", "verify", AGENT, "--episodes", "1", cwd=empty, code=1)
     assert "models of our trained agents are in a checkout only" in said
     record = read_record(RESULTS / AGENT)
-    ours = own_files(record["environment"]["id"])[record["method"]]
+    ours = builtin_files(record["environment"]["id"])[record["method"]]
     copy = shutil.copy(ours, tmp_path / "model.zip")
-    assert job_of(record, copy).method == str(copy) and is_builtin_record(record, str(copy))
+    assert job_for_record(record, copy).method == str(copy) and is_builtin_record(record, str(copy))
     assert not is_builtin_record(record | {"method_sha256": "0" * 64}, str(copy))

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 import yaml
 from eitbench.bench import tracks
-from eitbench.bench.playing import run_on_measurements
-from eitbench.bench.records import read_record, read_records, sealed, write_record
+from eitbench.bench.records import read_record, read_records, with_content_hash, write_record
+from eitbench.bench.runner import run_on_measurements
 from eitbench.envs.measured import case_env
 from eitbench.measured.cases import CASES, case_id, file_sha256, read_case
 from eitbench.measured.segmentation import ktc_score
@@ -166,7 +166,7 @@ def test_submit_writes_records_with_the_scores_of_a_run(results):
 def test_the_leaderboard_shows_records(results):
     """The site and the text show them; titles are escaped, and an invalid file is omitted and named."""
     mine = read_record(record_path(results, "mine")) | {"title": "<b>mine</b>"}
-    record_path(results, "mine").write_text(json.dumps(sealed(mine)), "utf-8")
+    record_path(results, "mine").write_text(json.dumps(with_content_hash(mine)), "utf-8")
     write_record(results, record("homogeneous", [0.2, 0.3], role="floor"))
     assert eitbench("leaderboard", "--records", results)[0] == 0
     folder = results.parent

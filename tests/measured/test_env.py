@@ -8,7 +8,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from eitbench.bench.methods import load_method
-from eitbench.bench.playing import run_on_measurements
+from eitbench.bench.runner import run_on_measurements
 from eitbench.envs.estimation import EstimationEnv
 from eitbench.envs.measured import MeasuredEnv
 from eitbench.estimation.walk import RandomWalk

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import yaml
 from eitbench.bench.measured import plotted_steps
-from eitbench.bench.playing import run_on_measurements
+from eitbench.bench.runner import run_on_measurements
 from eitbench.envs.estimation import EstimationEnv
 from eitbench.envs.measured import MeasuredEnv
 from eitbench.measured import Measurements

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import yaml
-from eitbench.bench.playing import run_on_measurements
+from eitbench.bench.runner import run_on_measurements
 from eitbench.envs.measured import MeasuredEnv
 from eitbench.measured.segmentation import centroid_errors, ktc_score, read_truth, segment
 from scipy.io import savemat

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from eitbench.bench.playing import run_on_measurements
+from eitbench.bench.runner import run_on_measurements
 from eitbench.envs.measured import MeasuredEnv
 from eitbench.estimation.walk import matern32_transition, matern_modes
 from tanks import FIXED_STDS, VESSEL, moving

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 from eitbench._foreign import cleaned
-from eitbench.bench.records import read_records, sealed, write_record
+from eitbench.bench.records import read_records, with_content_hash, write_record
 from eitbench.bench.store import EpisodeStore
 from eitbench.bench.tracks import named
 from eitbench.cli.app import app
@@ -34,7 +34,7 @@ def hostile(text):
     for episode in odd["episodes"]:
         if episode["status"] != "ok":
             episode |= {"message": text, "where": text}
-    return [sealed(odd), plain, record("homogeneous", [0.2, 0.3, 0.2], role="floor")]
+    return [with_content_hash(odd), plain, record("homogeneous", [0.2, 0.3, 0.2], role="floor")]
 
 
 @pytest.mark.parametrize("text", TEXTS)

@@ -7,7 +7,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from eitbench.bench.methods import load_method
-from eitbench.bench.playing import estimates
+from eitbench.bench.runner import iter_estimates
 from eitbench.bench.tracks import Environment
 from matplotlib import pyplot as plt
 
@@ -70,7 +70,7 @@ def test_an_episode_shows_truth_and_estimate():
     axes = eitbench.plot.episode("homogeneous", PIPE, "dev:0", world=given, times=2)
     assert axes.shape == (2, 2)
     asked = Environment(PIPE).make(world=given)
-    said = dict(estimates(asked, load_method("homogeneous", "estimation"), 100_000))
+    said = dict(iter_estimates(asked, load_method("homogeneous", "estimation"), 100_000))
     errors = eitbench.evaluate("homogeneous", PIPE, "dev:0", world=given)["error"][0]
     told = []
     for truth, estimate in axes:

@@ -11,7 +11,7 @@ import shutil
 import subprocess
 
 import pytest
-from eitbench.bench.records import sealed
+from eitbench.bench.records import with_content_hash
 from eitbench.bench.store import EpisodeStore
 from eitbench.report.boards import run_leaderboards
 from eitbench.report.page import write_page
@@ -81,7 +81,7 @@ def widest():
              for name, error in errors.items()]
     for each in (episode for one in found for episode in one["episodes"]):
         each["peak_memory"] = 3_071_000_000
-    return [sealed(one) for one in found]
+    return [with_content_hash(one) for one in found]
 
 
 @pytest.fixture(scope="module")

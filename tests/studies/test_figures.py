@@ -194,7 +194,7 @@ def test_injection_is_drawn(monkeypatch, run_cache, tmp_path):
         jobs[0].environment: seed_ranges(list(dict.fromkeys(format_seed(job.seed)
                                                             for job in jobs)))}))
     monkeypatch.setattr(injection, "policy_rows", rows)
-    monkeypatch.setattr(injection, "results_in", lambda folder: [])
+    monkeypatch.setattr(injection, "folder_results", lambda folder: [])
     shorten(monkeypatch, {injection.ANIMATED[0]: SHORT})
     monkeypatch.setenv(CACHE_VARIABLE, run_cache)           # has the reduced model of other tests
     path, description = FIGURES["injection"](None, 1, tmp_path / "new")

@@ -19,8 +19,8 @@ from markupsafe import Markup
 
 from eitbench._files import PACKAGE, replace_folder, shipped
 from eitbench._foreign import as_cell, as_markdown
-from eitbench.bench.methods import baseline_folder, own_files, own_sha256, version_of
-from eitbench.bench.records import alike, file_name, finished, newest
+from eitbench.bench.methods import baseline_folder, builtin_files, builtin_sha256, version_of
+from eitbench.bench.records import finished_at, group_runs, record_file_name, split_outdated
 from eitbench.bench.table import NOTHING, Cell, Table, number_cell
 from eitbench.bench.text import scores_by_seed
 from eitbench.bench.tracks import home_of, named
@@ -151,9 +151,9 @@ def render(site: Site) -> dict[str, str]:
     parts += [*robustness.markdown_section(site.boards), *measured.markdown_section(site.measured)]
     if site.boards:
         parts += ["## Column descriptions", markdown_list(column_descriptions())]
-    if outdated := newest(site.records)[1]:
+    if outdated := split_outdated(site.records)[1]:
         parts += ["## Superseded records", "Made by an earlier version of the method.\n\n"
-                  + "\n".join(f"- {as_markdown(file_name(record))}" for record in outdated)]
+                  + "\n".join(f"- {as_markdown(record_file_name(record))}" for record in outdated)]
     table = leaderboard_table(site.boards)
     texts = {name: table[name].map(as_cell) for name in ("environment", "method", "title")}
     plain = table.assign(**texts).to_csv(index=False, float_format="%.6g", lineterminator="\n")
@@ -211,7 +211,7 @@ def index_page(site: Site) -> bytes:
         about=CATEGORY_TEXTS,
         robustness=ROBUSTNESS_PAGE if robustness.shift_families(site.boards) else "",
         measured=MEASURED_PAGE if site.measured.records else "",
-        last=max(map(finished, site.records), default="")[:10],
+        last=max(map(finished_at, site.records), default="")[:10],
         explanations=tables.explanations(table for boards in shown.values()
                                          for _, table, _ in boards))
 
@@ -298,7 +298,7 @@ def documentation(id: str) -> tuple[Markup, Markup]:
 def method_page(site: Site, name: str) -> bytes:
     """Return the HTML of the page of all versions of a method."""
     records = sorted((record for record in site.records if record["method"] == name),
-                     key=lambda record: (record["official"], finished(record)), reverse=True)
+                     key=lambda record: (record["official"], finished_at(record)), reverse=True)
     placements = [(board, row) for boards in site.classes.values() for board in boards
                   for row in board.rows if row.cells["method"] == name]
     addresses = {(row.cells["environment"], row.cells["version"]): board.address
@@ -339,10 +339,11 @@ def _version(records: list[dict[str, Any]], addresses: dict[tuple[str, str], str
     shown = []
     for each in sorted(records, key=lambda record: record["environment"]["name"]):
         runs = [group[0] | {"products": sorted(1000 * run["machine"]["matmul_seconds"]
-                                               for run in group)} for group in alike(each["runs"])]
+                                               for run in group)}
+                for group in group_runs(each["runs"])]
         shown.append({
             "title": environment_title(each), "official": each["official"], "runs": runs,
-            "file": file_name(each), "episodes": _episodes(each),
+            "file": record_file_name(each), "episodes": _episodes(each),
             "address": addresses.get((each["environment"]["name"], each["version"])),
             "commands": sorted({run["command"] for run in each["runs"]}),
             "failures": [episode for episode in each["episodes"] if episode["status"] != "ok"]})
@@ -370,7 +371,7 @@ def source_file(record: dict[str, Any]) -> str:
 
     Agents must be the very version, since others may use their names.
     """
-    path = own_files(record["environment"]["id"]).get(record["method"])
+    path = builtin_files(record["environment"]["id"]).get(record["method"])
     if path is None or not (path.suffix == ".py" or _is_version(record, path)):
         return ""
     return f"baselines/{path.relative_to(baseline_folder()).as_posix()}"
@@ -386,5 +387,5 @@ def docstring(record: dict[str, Any], file: str) -> Markup:
 
 def _is_version(record: dict[str, Any], path: Path) -> bool:
     """Return whether a file is the recorded version: by number, of third parties by content."""
-    sha256 = own_sha256(path)
+    sha256 = builtin_sha256(path)
     return record["version"] == version_of(path, sha256) or sha256 == record["method_sha256"]

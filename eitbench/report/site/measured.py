@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 import pandas as pd
 
-from eitbench.bench.records import finished, read_sound_files
+from eitbench.bench.records import finished_at, read_valid_files
 from eitbench.bench.scores import scores
 from eitbench.bench.table import Cell, Table, number_cell
 from eitbench.bench.text import number, scores_by_seed
@@ -42,9 +42,9 @@ class MeasuredBoards(NamedTuple):
     @classmethod
     def of(cls, leaderboards: Path) -> MeasuredBoards:
         """Read the records in the folder ``results`` of the leaderboards."""
-        found, complaints = read_sound_files(leaderboards / "results", measured=True)
+        found, complaints = read_valid_files(leaderboards / "results", measured=True)
         latest = {(record["environment"]["id"], record["method"]): record
-                  for record in sorted(found.values(), key=finished)
+                  for record in sorted(found.values(), key=finished_at)
                   if any(episode["status"] == "ok" for episode in record["episodes"])}
         cases: dict[str, MeasuredCase] = {}
         records: dict[str, list[dict[str, Any]]] = {}

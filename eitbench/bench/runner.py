@@ -15,7 +15,12 @@ from tqdm import tqdm
 from eitbench import _check
 from eitbench.bench.measured import MeasuredRun
 from eitbench.bench.methods import Method, load_method
-from eitbench.bench.outcomes import Claim, Said, outcome_of, outcome_of_claims
+from eitbench.bench.outcomes import (
+    EstimatorOutput,
+    ScoredEstimate,
+    estimation_outcome,
+    injection_outcome,
+)
 from eitbench.bench.scores import Outcome
 from eitbench.bench.tracks import Environment, board_of, check_track, is_measured
 from eitbench.data.seeds import allow_test_seeds
@@ -32,7 +37,7 @@ if TYPE_CHECKING:
     from eitbench.envs.measured import MeasuredEnv
 
 
-class Episode(NamedTuple):
+class EpisodeRun(NamedTuple):
     """A finished episode."""
 
     outcome: Outcome
@@ -45,39 +50,39 @@ class Episode(NamedTuple):
     """of a policy, JSON-ready"""
 
 
-def environment(asked: Environment) -> Any:
+def cached_environment(asked: Environment) -> Any:
     """Make an environment once a process, so that all its episodes share its models, and what
     methods derive from them; errors as `Environment.make`."""
     if is_measured(asked.id):
-        return _made(asked, None, "")
+        return _cached_environment(asked, None, "")
     registered = entry(asked.id)
-    return _made(asked, registered.world, json.dumps(dict(registered.settings)))
+    return _cached_environment(asked, registered.world, json.dumps(dict(registered.settings)))
 
 
 @lru_cache(maxsize=4)
-def _made(asked: Environment, world: World | None, settings: str) -> Any:
+def _cached_environment(asked: Environment, world: World | None, settings: str) -> Any:
     """Make it; ``world`` and ``settings`` of the id may be registered again."""
     return asked.make()
 
 
-def can_play(method: Method, env: Any) -> bool:
+def is_compatible(method: Method, env: Any) -> bool:
     """Return whether an environment belongs to one of a method's boards and suits it."""
     known = env.rules if isinstance(env, InjectionEnv) else env.task
     return board_of(env) in method.boards and method.suits(known)
 
 
-def play(asked: Environment, method: Method, seed: int) -> Episode:
+def run_method(asked: Environment, method: Method, seed: int) -> EpisodeRun:
     """Run one whole episode. ``ValueError`` if there is no such environment, it is of another track
     than the method, or the method does not suit it or returns an invalid answer."""
     check_track(asked.id, method.track)
-    env = environment(asked)
+    env = cached_environment(asked)
     if isinstance(env, InjectionEnv):
-        return _injected(env, method, seed)
+        return _run_policy(env, method, seed)
     if is_measured(asked.id):
         run = run_on_measurements(env, method, seed, kept={env.episode_steps})
         measurements = env.measurements
-        return Episode(run.outcome(env), measurements.currents[measurements.injection_index], {})
-    return estimated(env, method, seed)
+        return EpisodeRun(run.outcome(env), measurements.currents[measurements.injection_index], {})
+    return run_estimator(env, method, seed)
 
 
 def run_on_measurements(env: MeasuredEnv, method: str | Method, seed: int = 0, *,
@@ -96,7 +101,7 @@ def run_on_measurements(env: MeasuredEnv, method: str | Method, seed: int = 0, *
     if not method.suits(env.task):
         raise ValueError(f"method must suit a target that {_motion(env.task)}, got {method.name}")
     with threadpool_limits(1):
-        steps = tqdm(_estimates(env, method, seed), total=env.episode_steps, desc=method.name,
+        steps = tqdm(_iter_steps(env, method, seed), total=env.episode_steps, desc=method.name,
                      unit="reading", disable=None, leave=False)
         return MeasuredRun.collect(env, method.name, steps, kept)
 
@@ -109,40 +114,40 @@ def _motion(task: Task) -> str:
     return f"is carried by a flow that is {'known' if task.velocity is None else 'estimated'}"
 
 
-def estimated(env: EstimationEnv, estimator: Method, seed: int) -> Episode:
+def run_estimator(env: EstimationEnv, estimator: Method, seed: int) -> EpisodeRun:
     """Run an estimator on one whole episode."""
-    said = Said.collect(env.task, _estimates(env, estimator, seed))
-    return Episode(outcome_of(env, said), said.currents, said.fields())
+    said = EstimatorOutput.collect(env.task, _iter_steps(env, estimator, seed))
+    return EpisodeRun(estimation_outcome(env, said), said.currents, said.fields())
 
 
-def _injected(env: InjectionEnv, policy: Method, seed: int) -> Episode:
+def _run_policy(env: InjectionEnv, policy: Method, seed: int) -> EpisodeRun:
     seconds = 0.0
     currents = list[np.ndarray]()
-    claims = list[Claim]()
+    claims = list[ScoredEstimate]()
     actions = list[Any]()
-    # the clock of `injections` stands still while the filter is asked
-    for t, observation, elapsed in injections(env, policy, seed, actions):
+    # the clock of `iter_injections` stands still while the filter is asked
+    for t, observation, elapsed in iter_injections(env, policy, seed, actions):
         seconds += elapsed
         currents.append(observation["currents"])
         if (error := env.error) is not None:
             means, stds = env.core.estimate()
-            claims.append(Claim(t, error, means[0], stds[0], env.core.innovations()[0]))
+            claims.append(ScoredEstimate(t, error, means[0], stds[0], env.core.innovations()[0]))
     spent = sum(bool(each.any()) for each in currents)
-    outcome = outcome_of_claims(env.core.world, seed, claims, seconds / env.core.length, spent)
-    return Episode(outcome, np.array(currents), {}, actions)
+    outcome = injection_outcome(env.core.world, seed, claims, seconds / env.core.length, spent)
+    return EpisodeRun(outcome, np.array(currents), {}, actions)
 
 
-def injections(env: InjectionEnv, policy: Method, seed: int, actions: list[Any] | None = None,
+def iter_injections(env: InjectionEnv, policy: Method, seed: int, actions: list[Any] | None = None,
                ) -> Iterator[tuple[int, dict[str, np.ndarray], float]]:
     """Yield (t of the observed state, observation, seconds the policy took) after each injection of
-    one episode, the first including its preparation; errors as `play`. ``actions`` receives the
-    actions."""
+    one episode. The first time includes the policy's constructor. ``actions`` receives the actions.
+    Errors as `run_method`."""
     if not policy.suits(env.rules):
         raise ValueError(f"policy {policy.name} does not suit {env.spec.id if env.spec else env}")
     with allow_test_seeds():
         observation, _ = env.reset(seed=seed)
     t = env.core.n_initial
-    random = policys_random(seed)
+    random = policy_generator(seed)
     begin = time.perf_counter()
     player = policy.make(env.rules, random, *[env.core] * policy.privileged)
     done = False
@@ -157,23 +162,23 @@ def injections(env: InjectionEnv, policy: Method, seed: int, actions: list[Any] 
         begin = time.perf_counter()
 
 
-def policys_random(seed: int) -> np.random.Generator:
+def policy_generator(seed: int) -> np.random.Generator:
     """Return the generator that a policy draws from in the episode of this seed."""
     # A generator reveals its seed, so the policy's gets a state only.
     drawn = np.random.default_rng(int(episode_streams(seed).policy.integers(2**63)))
     return generator_from_state(drawn.bit_generator.state)
 
 
-def estimates(env: EstimationEnv, estimator: Method,
+def iter_estimates(env: EstimationEnv, estimator: Method,
               seed: int) -> Iterator[tuple[int, Estimate]]:
     """Yield (t, estimate of the state t ≥ 1) in one episode. The estimator gets the task and the
     measurements, neither rewards nor the environment."""
-    for t, estimate, _, _ in _estimates(env, estimator, seed):
+    for t, estimate, _, _ in _iter_steps(env, estimator, seed):
         if estimate is not None and t >= 1:
             yield t, estimate
 
 
-def _estimates(env: EstimationEnv | MeasuredEnv, estimator: Method, seed: int,
+def _iter_steps(env: EstimationEnv | MeasuredEnv, estimator: Method, seed: int,
                ) -> Iterator[tuple[int, Estimate | None, dict[str, np.ndarray], float]]:
     """Yield (t = i − lag, estimate, measurement i, seconds the estimator took) at each step i."""
     with allow_test_seeds():
