@@ -90,7 +90,7 @@ def naive_baseline_records(folder: Path) -> list[dict[str, Any]]:
     """Return the records from which gains are counted: of the package, and of a folder, which
     precede."""
     folders = dict.fromkeys([BUNDLED_RECORDS.resolve(), folder.resolve()])
-    return newest([record for each in folders for record in read_records(each)
+    return split_outdated([record for each in folders for record in read_records(each)
                    if is_naive_baseline(record)])[0]
 
 

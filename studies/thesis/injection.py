@@ -15,7 +15,7 @@ from eitbench._files import shipped
 from eitbench.bench.methods import baseline_folder
 from eitbench.bench.run import pending_jobs, run_jobs
 from eitbench.bench.store import EpisodeStore, folder_results
-from eitbench.bench.suites import jobs as jobs_of
+from eitbench.bench.suites import make_jobs
 from eitbench.bench.text import mean_and_interval
 from eitbench.data.seeds import format_seed
 from eitbench.report.animate import animate
@@ -52,7 +52,7 @@ def injection(seeds: list[int] | None, jobs: int, out: Path) -> tuple[Path, str]
     panels = figure.subplots(3, 3, height_ratios=(4, 4, 3))
     tables = []
     for (env, title), axes in zip(WORLDS.items(), panels[:2].flat, strict=True):
-        todo = jobs_of("injection", [env], [], seeds)
+        todo = make_jobs("injection", [env], [], seeds)
         run_jobs(pending_jobs(todo, recorded), store, n_jobs=jobs,
                  command="python studies/thesis injection")
         rows = policy_rows(todo, [*recorded, *store.results()])
@@ -73,7 +73,7 @@ def injection(seeds: list[int] | None, jobs: int, out: Path) -> tuple[Path, str]
     path = out / "injection.png"
     save_figure(figure, path)
     env, policy = ANIMATED
-    first = jobs_of("injection", [env], [policy], seeds)[0].seed
+    first = make_jobs("injection", [env], [policy], seeds)[0].seed
     animation = animate(env, [policy], format_seed(first), None, out / "injection.gif")
     return path, "\n".join([*tables, f"wrote {animation}: {policy} in {env}"])
 
