@@ -17,7 +17,7 @@ MODELS = HERE / "models" / "linearised"
 
 
 class Estimator:
-    boards = ("filter", "fixed-lag")
+    subtracks = ("filter", "fixed-lag")
 
     def __init__(self, task: Task) -> None:
         prior = compatible_priors(HERE / "priors", task, LINK)[0]

@@ -44,7 +44,7 @@ LEVEL_STD = 0.05
 
 
 class Estimator:
-    boards = ("filter", "fixed-lag", "smoothing")
+    subtracks = ("filter", "fixed-lag", "smoothing")
     parameters = {  # noqa: RUF012 (as a record has it)
         "bounds": list(BOUNDS), "window": WINDOW, "factor_std": FACTOR_STD, "level_std": LEVEL_STD}
 

@@ -16,7 +16,7 @@ LINK = "linear"
 
 
 class Estimator:
-    boards = ("filter", "fixed-lag")
+    subtracks = ("filter", "fixed-lag")
 
     def __init__(self, task: Task) -> None:
         prior = compatible_priors(PRIORS, task, LINK)[0]

@@ -31,7 +31,7 @@ SEED = 0
 
 
 class Estimator:
-    boards = ("filter",)
+    subtracks = ("filter",)
     parameters = {  # noqa: RUF012 (as a record has it)
         "members": MEMBERS, "lead_in": LEAD_IN, "bounds": list(BOUNDS), "seed": SEED}
 

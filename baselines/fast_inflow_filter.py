@@ -29,7 +29,7 @@ BENT = 48
 
 
 class Estimator:
-    boards = ("filter",)
+    subtracks = ("filter",)
 
     def __init__(self, task: Task) -> None:
         prior = compatible_priors(PRIORS, task, LINK)[0]

@@ -18,7 +18,7 @@ WINDOW = 16  # injections
 
 
 class Estimator:
-    boards = ("filter",)
+    subtracks = ("filter",)
     parameters = {"factors": list(FACTORS), "window": WINDOW}  # noqa: RUF012 (as a record has it)
 
     def __init__(self, task: Task) -> None:

@@ -15,7 +15,7 @@ from eitbench.estimation import (
 
 
 class Estimator:
-    boards = ("smoothing",)
+    subtracks = ("smoothing",)
 
     def __init__(self, task: Task) -> None:
         self.task = task

@@ -13,7 +13,7 @@ from eitbench.estimation import (
 
 
 class Estimator:
-    boards = ("fixed-lag",)
+    subtracks = ("fixed-lag",)
 
     def __init__(self, task: Task) -> None:
         self.estimator = FilterEstimator(task, lambda c_ref: FixedLagSmoother(task, c_ref))

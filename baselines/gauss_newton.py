@@ -18,7 +18,7 @@ ALPHA = 0.177
 
 
 class Estimator:
-    boards = ("filter", "smoothing")
+    subtracks = ("filter", "smoothing")
     parameters = {"alpha": ALPHA}  # noqa: RUF012 (as a record has it)
 
     def __init__(self, task: Task) -> None:

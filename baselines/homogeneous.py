@@ -8,7 +8,7 @@ from eitbench.estimation import best_homogeneous
 
 
 class Estimator:
-    boards = ("filter", "fixed-lag", "smoothing")
+    subtracks = ("filter", "fixed-lag", "smoothing")
     role = "floor"
 
     def __init__(self, task: Task) -> None:

@@ -23,7 +23,7 @@ HERE = Path(__file__).parent
 
 
 class Estimator:
-    boards = ("filter", "fixed-lag", "smoothing")
+    subtracks = ("filter", "fixed-lag", "smoothing")
 
     def __init__(self, task: Task) -> None:
         prior = compatible_priors(HERE / "priors", task, "logarithm")[0]

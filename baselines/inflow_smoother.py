@@ -13,7 +13,7 @@ PRIORS = Path(__file__).with_name("priors")
 
 
 class Estimator:
-    boards = ("smoothing",)
+    subtracks = ("smoothing",)
 
     def __init__(self, task: Task) -> None:
         prior = compatible_priors(PRIORS, task, "logarithm")[0]

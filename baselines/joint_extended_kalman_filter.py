@@ -14,7 +14,7 @@ BOUNDS = (0.05, 4.0)
 
 
 class Estimator:
-    boards = ("filter",)
+    subtracks = ("filter",)
     parameters = {"bounds": list(BOUNDS)}  # noqa: RUF012 (as a record has it)
 
     def __init__(self, task: Task) -> None:

@@ -31,7 +31,7 @@ FACTOR_WALK = 0.0
 
 
 class Estimator:
-    boards = ("filter",)
+    subtracks = ("filter",)
     parameters = {  # noqa: RUF012 (as a record has it)
         "window": WINDOW, "bounds": list(BOUNDS), "factor_std": FACTOR_STD,
         "factor_walk": FACTOR_WALK}

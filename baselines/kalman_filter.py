@@ -8,7 +8,7 @@ from eitbench.estimation import FilterEstimator, linearise_at_reference, nodal_f
 
 
 class Estimator:
-    boards = ("filter",)
+    subtracks = ("filter",)
 
     def __init__(self, task: Task) -> None:
         self.estimator = FilterEstimator(task, lambda c_ref: nodal_filter(

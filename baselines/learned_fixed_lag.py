@@ -25,7 +25,7 @@ LAG = 4
 
 
 class Estimator:
-    boards = ("fixed-lag",)
+    subtracks = ("fixed-lag",)
     parameters = {"network": NETWORK}  # noqa: RUF012 (as a record has it)
 
     def __init__(self, task: Task) -> None:

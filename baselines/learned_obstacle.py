@@ -24,7 +24,7 @@ NETWORK = "networks/pipe2d-obstacle.npz"
 
 
 class Estimator:
-    boards = ("filter",)
+    subtracks = ("filter",)
     parameters = {"network": NETWORK}  # noqa: RUF012 (as a record has it)
 
     def __init__(self, task: Task) -> None:

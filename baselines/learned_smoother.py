@@ -31,7 +31,7 @@ LAG = 20
 
 
 class Estimator:
-    boards = ("smoothing",)
+    subtracks = ("smoothing",)
     parameters = {"network": NETWORK, "lag": LAG}  # noqa: RUF012 (as a record has it)
 
     def __init__(self, task: Task) -> None:

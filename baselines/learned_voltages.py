@@ -23,7 +23,7 @@ NETWORK = "networks/pipe2d-voltages.npz"
 
 
 class Estimator:
-    boards = ("filter",)
+    subtracks = ("filter",)
     parameters = {"network": NETWORK}  # noqa: RUF012 (as a record has it)
 
     def __init__(self, task: Task) -> None:

@@ -13,7 +13,7 @@ from eitbench.physics.stationary import StationaryTransport
 
 
 class Estimator:
-    boards = ("filter",)
+    subtracks = ("filter",)
 
     def __init__(self, task: Task) -> None:
         self.task = task

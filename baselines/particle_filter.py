@@ -24,7 +24,7 @@ SEED = 0
 
 
 class Estimator:
-    boards = ("filter",)
+    subtracks = ("filter",)
     parameters = {"level_std": LEVEL_STD, "particles": PARTICLES, "seed": SEED}  # noqa: RUF012
 
     def __init__(self, task: Task) -> None:

@@ -15,7 +15,7 @@ ALPHA = 0.177  # that of gauss_newton.py
 
 
 class Estimator:
-    boards = ("filter", "fixed-lag", "smoothing")
+    subtracks = ("filter", "fixed-lag", "smoothing")
     role = "floor"
     parameters = {"alpha": ALPHA}  # noqa: RUF012 (as a record has it)
 

@@ -25,7 +25,7 @@ HERE = Path(__file__).parent
 
 
 class Estimator:
-    boards = ("filter",)
+    subtracks = ("filter",)
 
     def __init__(self, task: Task) -> None:
         prior = compatible_priors(HERE / "priors", task, "logarithm")[0]

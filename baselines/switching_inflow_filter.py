@@ -21,7 +21,7 @@ LEVEL_STD = 0.05
 
 
 class Estimator:
-    boards = ("filter",)
+    subtracks = ("filter",)
     parameters = {"level_std": LEVEL_STD}  # noqa: RUF012 (as a record has it)
 
     def __init__(self, task: Task) -> None:

@@ -34,7 +34,7 @@ PRIORS = Path(__file__).with_name("priors")
 
 
 class Estimator:
-    boards = ("filter", "fixed-lag", "smoothing")
+    subtracks = ("filter", "fixed-lag", "smoothing")
     role = "reference"
     privileged = True
 

@@ -16,7 +16,7 @@ AXES = 40
 
 
 class Estimator:
-    boards = ("filter",)
+    subtracks = ("filter",)
     parameters = {"axes": AXES}  # noqa: RUF012 (as a record has it)
 
     def __init__(self, task: Task) -> None:

@@ -17,7 +17,7 @@ from resource import RUSAGE_CHILDREN, getrusage
 
 from common import ONE_THREAD, Row
 
-from eitbench.bench.tracks import own_ids
+from eitbench.bench.tracks import builtin_ids
 
 OBSERVATION = "import sys, gymnasium, eitbench\ngymnasium.make(sys.argv[1]).reset()"
 RECORD = """
@@ -53,7 +53,7 @@ SOLID = ("eitbench/Pipe3D-v0", "eitbench/Pipe3DSmoothing-v0")
 def rows() -> Iterator[Row]:
     yield _against_a_second_time("eitbench list", ["-m", "eitbench.cli", "list"], "≤ 1 s",
                                  "Python: importing numpy, scipy and the baselines")
-    for id in own_ids():
+    for id in builtin_ids():
         yield observation(id)
     if find_spec("stable_baselines3"):
         yield learning()

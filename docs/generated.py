@@ -9,8 +9,8 @@ from pathlib import Path
 
 import eitbench
 from eitbench.bench.methods import builtin_methods, load_method
-from eitbench.bench.text import with_interval
-from eitbench.bench.tracks import own_ids
+from eitbench.bench.text import format_interval
+from eitbench.bench.tracks import builtin_ids
 
 ROOT = Path(__file__).resolve().parent.parent
 REFERENCE = {
@@ -58,7 +58,7 @@ def environments() -> Files:
     """A page for each id of ours: its animation, what it asks for, its board."""
     files: Files = {}
     rows = scores()
-    for id in own_ids():
+    for id in builtin_ids():
         name = id.partition("/")[2]
         slug = id.replace("/", "-")
         media = ROOT / "leaderboards" / "media" / f"{slug}.webp"
@@ -118,7 +118,7 @@ def table(rows: list[dict[str, str]], first: str) -> str:
     """Ranks and errors of some lines of the boards, named by method or by environment."""
     lines = ["| | rank | ẽ_c (95 % interval) | gain over the floor |", "|---|---:|---:|---:|"]
     for row in rows:
-        error = with_interval(*(float(row[key] or "nan")
+        error = format_interval(*(float(row[key] or "nan")
                                 for key in ("error", "error_low", "error_high")))
         gain = f"{float(row['gain']):.2f}" if row["gain"] else "–"
         lines.append(f"| {name_of(row, first)} | {row['rank'] or row['note'] or '–'} | {error} | "

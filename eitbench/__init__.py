@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import gymnasium as _gym
 
-from eitbench._extras import needed_by as _needed_by
+from eitbench._extras import require_extra as _require_extra
 from eitbench.worlds import catalogue as _catalogue  # noqa: F401 (registers the ids)
 from eitbench.worlds.registry import register, register_installed
 
@@ -50,7 +50,7 @@ _LAZY_MODULES = {"leaderboard": "bench", "plot": "report.plot"}
 
 def __getattr__(name: str) -> Any:
     """Import public names on first use (PEP 562)."""
-    with _needed_by(f"eitbench.{name}"):
+    with _require_extra(f"eitbench.{name}"):
         if name in _LAZY_NAMES:
             return getattr(import_module(f"eitbench.{_LAZY_NAMES[name]}"), name)
         if name in _LAZY_MODULES:

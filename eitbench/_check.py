@@ -10,9 +10,9 @@ from typing import Any
 
 import numpy as np
 
-NUMBERS = "biufO"
+NUMERIC_KINDS = "biufO"
 """Kinds of arrays that can hold real numbers; not complex ones, dates or text."""
-DEEPEST = 20
+MAX_DEPTH = 20
 """Default of the depth to which lists and dicts may be nested."""
 
 
@@ -22,7 +22,7 @@ def number(name: str, value: object, *, low: float = -math.inf, high: float = ma
     ``ValueError`` for others, for booleans, and for what `array` rejects."""
     try:
         kind = np.asarray(value).dtype.kind
-        if kind == "b" or kind not in NUMBERS:
+        if kind == "b" or kind not in NUMERIC_KINDS:
             raise TypeError
         result = float(value)  # type: ignore[arg-type]
     except (TypeError, ValueError, OverflowError):
@@ -61,7 +61,7 @@ def array(name: str, value: object, shape: Iterable[int | None], *, units: str =
     try:
         given = np.asarray(value)
         came += f" of {given.dtype}"
-        if given.dtype.kind not in NUMBERS or isinstance(value, np.ma.MaskedArray):
+        if given.dtype.kind not in NUMERIC_KINDS or isinstance(value, np.ma.MaskedArray):
             raise TypeError
         if given.dtype.kind == "O" and any(isinstance(each, (str, bytes)) for each in given.flat):
             raise TypeError
@@ -85,7 +85,7 @@ def array(name: str, value: object, shape: Iterable[int | None], *, units: str =
     return result
 
 
-def nearest(given: object, known: Iterable[str]) -> str:
+def did_you_mean(given: object, known: Iterable[str]) -> str:
     """Return ``. Did you mean …?`` to append to a message that lists ``known``; empty if no name
     is similar."""
     names = {name.casefold(): name for name in known}
@@ -93,7 +93,7 @@ def nearest(given: object, known: Iterable[str]) -> str:
     return f". Did you mean {names[found[0]]}?" if found else ""
 
 
-def nesting(name: str, value: Any, deepest: int = DEEPEST) -> None:
+def depth(name: str, value: Any, deepest: int = MAX_DEPTH) -> None:
     """``ValueError`` if lists and dicts are nested deeper."""
     level = [value]
     for _ in range(deepest):
@@ -104,15 +104,15 @@ def nesting(name: str, value: Any, deepest: int = DEEPEST) -> None:
     raise ValueError(f"{name} must not be nested deeper than {deepest} levels")
 
 
-def document(name: str, value: object, size: int) -> None:
+def json_object(name: str, value: object, size: int) -> None:
     """``ValueError`` unless ``value`` is a dict that JSON holds in ``size`` bytes, with finite
-    numbers, also as floats, and no deeper than `nesting` accepts."""
+    numbers, also as floats, and no deeper than `depth` accepts."""
     try:
         if not isinstance(value, dict):
             raise TypeError(f"got {type(value).__name__}")
         text = json.dumps(value, allow_nan=False)
         json.loads(text, parse_int=lambda digits: math.trunc(float(digits)))
-        nesting(name, value)
+        depth(name, value)
     except (TypeError, ValueError, OverflowError, RecursionError) as error:
         raise ValueError(f"{name} must be a dict fit for JSON: {error}") from None
     if len(text) > size:

@@ -16,7 +16,7 @@ EXTRAS = {
 """Extra -> modules that environments do not need."""
 
 
-def explained(what: str, error: ModuleNotFoundError) -> str | None:
+def missing_extra(what: str, error: ModuleNotFoundError) -> str | None:
     """Return a sentence with the extra that installs the missing module; None if none does."""
     missing = (error.name or "").partition(".")[0]
     for extra, modules in EXTRAS.items():
@@ -27,11 +27,11 @@ def explained(what: str, error: ModuleNotFoundError) -> str | None:
 
 
 @contextmanager
-def needed_by(what: str) -> Iterator[None]:
+def require_extra(what: str) -> Iterator[None]:
     """Add the extra that ``what`` needs to a `ModuleNotFoundError`."""
     try:
         yield
     except ModuleNotFoundError as error:
-        if (sentence := explained(what, error)) is None:
+        if (sentence := missing_extra(what, error)) is None:
             raise
         raise ModuleNotFoundError(sentence, name=error.name) from error

@@ -11,14 +11,14 @@ from tempfile import TemporaryDirectory
 
 PACKAGE = Path(__file__).parent
 """Folder of this package."""
-SHIPPED = ("baselines", "leaderboards")
+BUNDLED = ("baselines", "leaderboards")
 """Folders that come with the package. Models of agents, learned networks, animations and the
 rendered site are in a checkout only: with them an installed package would be four times as
 large."""
 
 
 @contextmanager
-def replacing(path: Path) -> Iterator[Path]:
+def atomic_path(path: Path) -> Iterator[Path]:
     """Yield a temporary path that replaces ``path`` if no error occurs; create parent folders."""
     path.parent.mkdir(parents=True, exist_ok=True)
     # unlike a file of mkstemp, with the permissions of the umask
@@ -32,7 +32,7 @@ def replacing(path: Path) -> Iterator[Path]:
 
 def write_atomically(path: Path, data: bytes) -> None:
     """Write a file as a whole or not at all; create parent folders."""
-    with replacing(path) as temporary:
+    with atomic_path(path) as temporary:
         temporary.write_bytes(data)
 
 
@@ -55,15 +55,15 @@ def replace_folder(folder: Path, files: Mapping[str, bytes]) -> None:
             raise
 
 
-def shipped(name: str) -> Path:
-    """Return a folder of `SHIPPED`: inside an installed package, beside it in a checkout."""
+def bundled_path(name: str) -> Path:
+    """Return a folder of `BUNDLED`: inside an installed package, beside it in a checkout."""
     return PACKAGE / name if (PACKAGE / name).is_dir() else PACKAGE.parent / name
 
 
-def readable(path: Path) -> Path:
-    """Return ``path`` if it exists; else, if it begins with one of `SHIPPED` and exists there, the
+def resolve_input(path: Path) -> Path:
+    """Return ``path`` if it exists; else, if it begins with one of `BUNDLED` and exists there, the
     shipped file or folder."""
-    if path.exists() or not path.parts or path.parts[0] not in SHIPPED:
+    if path.exists() or not path.parts or path.parts[0] not in BUNDLED:
         return path
-    found = shipped(path.parts[0]).joinpath(*path.parts[1:])
+    found = bundled_path(path.parts[0]).joinpath(*path.parts[1:])
     return found if found.exists() else path

@@ -8,22 +8,22 @@ import time
 
 from tqdm import tqdm
 
-PATIENCE = 2.0
+NOTIFY_AFTER_S = 2.0
 """Seconds of work without a notice."""
-NAME = "eitbench"
+LOGGER_NAME = "eitbench"
 """Name of the logger, and prefix of notices."""
 
 
-def say(text: str) -> None:
+def notify(text: str) -> None:
     """Print a line on a terminal or in a notebook; elsewhere log it with level INFO."""
     if sys.stderr is not None and (sys.stderr.isatty() or "ipykernel" in sys.modules):
-        tqdm.write(f"{NAME}: {text}", file=sys.stderr)
+        tqdm.write(f"{LOGGER_NAME}: {text}", file=sys.stderr)
     else:
-        logging.getLogger(NAME).info(text)
+        logging.getLogger(LOGGER_NAME).info(text)
 
 
-class Wait:
-    """Report once that work of ``total`` steps is going to take longer than `PATIENCE`.
+class SlowTaskNotice:
+    """Report once that work of ``total`` steps is going to take longer than `NOTIFY_AFTER_S`.
 
     Parameters
     ----------
@@ -47,6 +47,6 @@ class Wait:
         self._done += steps
         passed = time.monotonic() - self._begin
         whole = passed * self._total / self._done
-        if not self._is_reported and passed >= 0.25 * PATIENCE and whole > PATIENCE:
+        if not self._is_reported and passed >= 0.25 * NOTIFY_AFTER_S and whole > NOTIFY_AFTER_S:
             self._is_reported = True
-            say(f"{self._what}, {whole:.0f} s or less; {self._beforehand}")
+            notify(f"{self._what}, {whole:.0f} s or less; {self._beforehand}")

@@ -76,13 +76,13 @@ def spread_ratio(mean: np.ndarray, std: np.ndarray, truth: np.ndarray,
     return float(variance / np.average(((mean - truth)**2).mean(axis=0), weights=weights))
 
 
-def skill(error: float, homogeneous: float, reference: float) -> float:
+def normalised_score(error: float, homogeneous: float, reference: float) -> float:
     """(E_bh − E)/(E_bh − E_ref): 0 for the homogeneous estimate, 1 for the reference; higher is
     better."""
     return (homogeneous - error) / (homogeneous - reference)
 
 
-def deficit_centre(values: np.ndarray, points: np.ndarray, weights: np.ndarray) -> np.ndarray:
+def deficit_centroid(values: np.ndarray, points: np.ndarray, weights: np.ndarray) -> np.ndarray:
     """(d,) centroid in m of the deficit median − value, where it exceeds half its maximum.
 
     Takes nodal ``values`` (n,), ``points`` (n, d) in m, and ``weights`` (n,), the nodes' areas:

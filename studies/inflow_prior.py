@@ -12,7 +12,7 @@ import numpy as np
 from tqdm import tqdm
 
 import eitbench
-from eitbench.bench.text import mean_and_interval, rounded
+from eitbench.bench.text import format_mean, mean_and_interval
 from eitbench.data.seeds import parse_seeds
 from eitbench.estimation import FilterEstimator, InflowPrior, fit_prior_from_episodes, inflow_filter
 from eitbench.worlds.registry import entry
@@ -46,8 +46,8 @@ def main() -> None:
         runs = [run_filter(prior, seed)
                 for seed in tqdm(EPISODES, desc=f"{count} episodes", leave=False, disable=None)]
         errors, nis = zip(*runs, strict=True)
-        print(f"| {count} | {prior.modes.shape[1]} | {rounded(*mean_and_interval(list(errors)))} | "
-              f"{np.mean(nis):.2f} |", flush=True)
+        error = format_mean(*mean_and_interval(list(errors)))
+        print(f"| {count} | {prior.modes.shape[1]} | {error} | {np.mean(nis):.2f} |", flush=True)
 
 
 if __name__ == "__main__":

@@ -14,7 +14,7 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 from tqdm import tqdm
 
-from eitbench.bench.text import mean_and_interval, rounded
+from eitbench.bench.text import format_mean, mean_and_interval
 from eitbench.data.seeds import parse_seeds
 from eitbench.envs.injection_core import InjectionCore
 from eitbench.estimation.onboard.rules import INFLOW_MODELS, Rules
@@ -38,7 +38,7 @@ def main() -> None:
         cells = []
         for inflow, estimator in tqdm(filters, desc=name, leave=False, disable=None):
             core = InjectionCore(Rules(world, gate, inflow=inflow), estimator)
-            cells.append(rounded(*mean_and_interval(list(errors(core, seeds, pairs)))))
+            cells.append(format_mean(*mean_and_interval(list(errors(core, seeds, pairs)))))
         print(f"| {name} | " + " | ".join(cells) + " |", flush=True)
 
 

@@ -11,10 +11,10 @@ import json
 
 from tqdm import tqdm
 
-from eitbench._files import shipped
+from eitbench._files import bundled_path
 from eitbench.bench.records import read_records
 from eitbench.bench.run import Job, run_episode
-from eitbench.bench.text import mean_and_interval, rounded, scores_by_seed, seed_ranges
+from eitbench.bench.text import format_mean, mean_and_interval, scores_by_seed, seed_ranges
 from eitbench.bench.tracks import Environment
 from eitbench.bench.verify import job_for_record
 from eitbench.data.seeds import parse_seeds
@@ -28,7 +28,7 @@ POLICIES = {"Pipe2DInjection": ("best_pair", "random_pair"),
 
 def main() -> None:
     records = {(record["environment"]["name"], record["method"]): record
-               for record in read_records(shipped("leaderboards") / "results")}
+               for record in read_records(bundled_path("leaderboards") / "results")}
     print("| environment | episodes | policy | full | full − reduced "
           "|\n|---|---|---|---:|---:|")
     for world, policies in POLICIES.items():
@@ -43,7 +43,7 @@ def main() -> None:
                 for seed in tqdm(full_errors, desc=f"{world}, {policy}", leave=False, disable=None)]
             error, _ = mean_and_interval(list(full_errors.values()))
             print(f"| {world} | {seed_ranges(list(full_errors))} | {policy} | {error:.4f} | "
-                  f"{rounded(*mean_and_interval(differences))} |", flush=True)
+                  f"{format_mean(*mean_and_interval(differences))} |", flush=True)
 
 
 if __name__ == "__main__":

@@ -6,5 +6,5 @@ from eitbench.bench.table import Table
 
 def said(table: Table) -> pd.DataFrame:
     """All cells as plain text, under their headings."""
-    return pd.DataFrame([[cell.plain for cell in row.cells] for row in table.rows],
+    return pd.DataFrame([[cell.plain_text for cell in row.cells] for row in table.rows],
                         columns=table.headings)

@@ -3,7 +3,7 @@
 from pathlib import Path
 
 import pytest
-from eitbench._files import readable, replace_folder, shipped
+from eitbench._files import bundled_path, replace_folder, resolve_input
 
 RECORDS = Path("leaderboards/results")
 
@@ -11,13 +11,13 @@ RECORDS = Path("leaderboards/results")
 def test_ours_are_read_where_there_are_none(tmp_path, monkeypatch):
     """A path as the README names it; one's own goes first, and what nobody has stays as it was asked for."""
     monkeypatch.chdir(tmp_path)
-    assert readable(RECORDS) == shipped("leaderboards") / "results"
-    assert readable(Path("baselines/rl/ppo.yml")).read_text().startswith("#")
+    assert resolve_input(RECORDS) == bundled_path("leaderboards") / "results"
+    assert resolve_input(Path("baselines/rl/ppo.yml")).read_text().startswith("#")
     for path in ("results", "leaderboards/elsewhere", "baselines", str(tmp_path / RECORDS)):
-        found = readable(Path(path))
-        assert found == (shipped("baselines") if path == "baselines" else Path(path))
+        found = resolve_input(Path(path))
+        assert found == (bundled_path("baselines") if path == "baselines" else Path(path))
     RECORDS.mkdir(parents=True)
-    assert readable(RECORDS) == RECORDS
+    assert resolve_input(RECORDS) == RECORDS
 
 
 def test_a_folder_is_replaced_as_a_whole(tmp_path):

@@ -4,7 +4,7 @@ import logging
 
 import pytest
 from eitbench import _notice
-from eitbench._notice import Wait
+from eitbench._notice import SlowTaskNotice
 
 
 @pytest.fixture
@@ -18,7 +18,7 @@ def clock(monkeypatch):
 @pytest.mark.parametrize(("seconds_a_step", "said"), [(0.1, 1), (0.01, 0)])
 def test_what_is_long_is_said_once(seconds_a_step, said, clock, caplog):
     caplog.set_level(logging.INFO, "eitbench")
-    wait = Wait("making it", 100, "a command does so beforehand")
+    wait = SlowTaskNotice("making it", 100, "a command does so beforehand")
     for _ in range(100):
         clock[0] += seconds_a_step
         wait.tick(1)
@@ -29,5 +29,5 @@ def test_what_is_long_is_said_once(seconds_a_step, said, clock, caplog):
 def test_a_terminal_is_told_there(monkeypatch, capsys, caplog):
     caplog.set_level(logging.INFO, "eitbench")
     monkeypatch.setattr(_notice.sys.stderr, "isatty", lambda: True, raising=False)
-    _notice.say("hello")
+    _notice.notify("hello")
     assert capsys.readouterr().err == "eitbench: hello\n" and not caplog.records

@@ -8,10 +8,10 @@ from eitbench.numerics.mesh import rectangle_mesh
 from eitbench.scoring import (
     coverage,
     crps,
-    deficit_centre,
+    deficit_centroid,
     normalised_innovations,
+    normalised_score,
     relative_error,
-    skill,
     spread_ratio,
     step_errors,
     voltage_discrepancy,
@@ -137,8 +137,8 @@ def test_spread_ratio_compares_variance_with_squared_error():
 
 def test_skill_runs_from_the_homogeneous_estimate_to_the_reference():
     """0 at E_bh, 1 at E_ref, linear between, negative beyond the homogeneous estimate."""
-    assert [skill(error, homogeneous=0.02, reference=0.004) for error in (0.02, 0.012, 0.004, 0.036)] == pytest.approx(
-        [0.0, 0.5, 1.0, -1.0])
+    values = [normalised_score(error, homogeneous=0.02, reference=0.004) for error in (0.02, 0.012, 0.004, 0.036)]
+    assert values == pytest.approx([0.0, 0.5, 1.0, -1.0])
 
 
 @pytest.mark.parametrize(("left", "right"), [((3, 4), (3, 5)), ((3, 4), (1, 4)), ((4,), (4,)), ((2, 3, 4), (2, 3, 4))])
@@ -164,9 +164,9 @@ def test_deficit_lies_in_the_middle_of_a_disc(centre):
     """A low disc of radius 0.2 in a level of 30, its nodes unevenly spaced: the centroid is its centre to a cell."""
     points, weights = plate()
     inside = np.hypot(*(points - centre).T) < 0.2
-    found = deficit_centre(30.0 - 10.0 * inside, points, weights)
+    found = deficit_centroid(30.0 - 10.0 * inside, points, weights)
     assert found.shape == (2,) and np.hypot(*(found - centre)) < 0.01
-    unweighted = deficit_centre(30.0 - 10.0 * inside, points, np.ones(len(points)))
+    unweighted = deficit_centroid(30.0 - 10.0 * inside, points, np.ones(len(points)))
     assert np.hypot(*(found - centre)) < np.hypot(*(unweighted - centre))       # dense nodes must not pull
 
 
@@ -178,10 +178,10 @@ def test_deficit_counts_only_what_is_lower_than_half():
         return depth * np.maximum(0.0, 1.0 - np.hypot(*(points - tip).T) / 0.25)
 
     values = 30.0 - cone((0.5, 0.5), 10.0) + cone((1.5, 0.7), 20.0) - cone((1.5, 0.3), 4.5)
-    np.testing.assert_allclose(deficit_centre(values, points, weights), (0.5, 0.5), atol=0.01)
+    np.testing.assert_allclose(deficit_centroid(values, points, weights), (0.5, 0.5), atol=0.01)
 
 
 def test_flat_field_is_lowest_in_its_middle():
     """Where nothing is lower than the rest, the centroid of the whole domain; not a division by zero."""
     points, weights = plate()
-    np.testing.assert_allclose(deficit_centre(np.full(len(points), 3.0), points, weights), (1.0, 0.5), rtol=1e-12)
+    np.testing.assert_allclose(deficit_centroid(np.full(len(points), 3.0), points, weights), (1.0, 0.5), rtol=1e-12)

@@ -36,7 +36,7 @@ from eitbench import Estimate, Task
 
 
 class Estimator:
-    boards = ("filter", "fixed-lag", "smoothing")
+    subtracks = ("filter", "fixed-lag", "smoothing")
     parameters = {parameters}
 
     def __init__(self, task: Task) -> None:

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from eitbench._extras import needed_by
+from eitbench._extras import require_extra
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -41,12 +41,12 @@ def load(folder: Path | str | None = None, *, measured: bool = False) -> pd.Data
     ValueError
         Naming the file, if one is not a valid record.
     """
-    with needed_by("eitbench.leaderboard.load"):
+    with require_extra("eitbench.leaderboard.load"):
         import pandas as pd
 
-        from eitbench._files import shipped
+        from eitbench._files import bundled_path
         from eitbench.bench.records import read_records, read_valid_files, split_outdated
-    path = Path(folder or shipped("leaderboards") / "results")
+    path = Path(folder or bundled_path("leaderboards") / "results")
     records = read_records(path, keep=_without_steps)
     if measured:
         records += read_valid_files(path, measured=True)[0].values()

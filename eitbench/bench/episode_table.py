@@ -16,16 +16,16 @@ from typing import Any
 
 from eitbench._files import write_atomically
 
-NAME = "episodes.csv.gz"
+TABLE_NAME = "episodes.csv.gz"
 _OF_RECORDS = ("board", "method", "version", "title", "role", "privileged", "official", "split")
 _COLUMNS = ("id", "environment", "kwargs", *_OF_RECORDS, "finished", "seed", "status",
             "peak_memory")
 """before the scores"""
 
 
-def table_beside(folder: Path) -> Path:
+def table_path(folder: Path) -> Path:
     """Return the path of the table that belongs to a folder of records."""
-    return folder.parent / NAME
+    return folder.parent / TABLE_NAME
 
 
 def write_episode_table(records: Iterable[dict[str, Any]], path: Path) -> None:

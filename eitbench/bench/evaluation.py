@@ -15,7 +15,7 @@ from eitbench import _check
 from eitbench.bench.methods import METHOD_KINDS, Method, load_method, method_from_class
 from eitbench.bench.run import Job
 from eitbench.bench.runner import run_method
-from eitbench.bench.scores import scored
+from eitbench.bench.scores import compute_scores
 from eitbench.bench.suites import isolated_job
 from eitbench.bench.tracks import Environment
 from eitbench.data.parallel import run_parallel
@@ -45,9 +45,9 @@ def evaluate(method: Any, env: str | gym.Env, seeds: str | Iterable[int], *,
     ``ValueError`` if an argument is wrong, or the method does not suit the environment. Exceptions
     of the method pass, with a note that names the episode.
     """
-    asked = environment_of(env, world)
+    asked = resolve_environment(env, world)
     if isolate is None:
-        runner: Method | Job = method_given(method, asked.track)
+        runner: Method | Job = resolve_method(method, asked.track)
     elif isinstance(method, str | Path):
         runner = isolated_job(asked, str(method), isolate)
     else:
@@ -77,10 +77,10 @@ def _row(asked: Environment, runner: Method | Job, seed: int) -> dict[str, Any]:
         error.add_note(f"{method.name} on {asked.id}, {format_seed(seed)}")
         raise
     return {"environment": asked.name, "method": method.name, "seed": format_seed(seed),
-            **scored(method.track, outcome)}
+            **compute_scores(method.track, outcome)}
 
 
-def environment_of(given: str | gym.Env, world: dict[str, Any] | None) -> Environment:
+def resolve_environment(given: str | gym.Env, world: dict[str, Any] | None) -> Environment:
     changes = {} if world is None else {"world": world}
     if isinstance(given, str):
         return Environment(given, json.dumps(changes))
@@ -92,7 +92,7 @@ def environment_of(given: str | gym.Env, world: dict[str, Any] | None) -> Enviro
     return Environment(spec.id, json.dumps(arguments | changes))
 
 
-def method_given(given: Any, track: str) -> Method:
+def resolve_method(given: Any, track: str) -> Method:
     if isinstance(given, str | Path):
         return load_method(str(given), track)
     if not isinstance(given, type):

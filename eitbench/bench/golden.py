@@ -30,7 +30,7 @@ from eitbench.bench.methods import (
     is_path,
     load_method,
 )
-from eitbench.bench.scores import scored, scores
+from eitbench.bench.scores import compute_scores, scores
 from eitbench.data.episode_cache import (
     build_cached_episode,
     cycle_voltages,
@@ -77,7 +77,7 @@ def golden_methods() -> dict[str, str]:
 
 def golden_path(name: str) -> Path:
     """Return the path of the golden file of a built-in id or method."""
-    folder = WORLD_FOLDER if name in tracks.own_ids() else METHOD_FOLDER
+    folder = WORLD_FOLDER if name in tracks.builtin_ids() else METHOD_FOLDER
     return folder / f"{name.replace('/', '-')}.json"
 
 
@@ -100,7 +100,7 @@ def check(name: str, *, is_quick: bool = False) -> list[str]:
         return [f"the golden file of {name} is damaged: {error}"]
     if expected is None:
         return [f"{name} has no golden file: {golden_path(name)} is missing"]
-    if name in tracks.own_ids():
+    if name in tracks.builtin_ids():
         return _world_differences(name, expected, is_quick=is_quick)
     if is_quick:
         expected["episodes"] = expected["episodes"][:1]
@@ -121,7 +121,7 @@ def update(names: list[str], *, new_version: bool = False) -> Iterator[tuple[str
 
     ``ValueError`` if a name is neither an id nor a built-in method's.
     """
-    ids, methods = tracks.own_ids(), golden_methods()
+    ids, methods = tracks.builtin_ids(), golden_methods()
     if unknown := [name for name in names if name not in ids and name not in methods]:
         raise ValueError(f"names must be ids, or methods of {', '.join(methods)}; got "
                          f"{', '.join(unknown)}")
@@ -379,10 +379,10 @@ def _run_episode(episode: dict[str, Any], method: str) -> dict[str, Any]:
     (seed,) = parse_seeds(episode["seed"])
     with threadpool_limits(1):                                  # as for records
         played = runner.run_method(asked, load_method(method, asked.track), seed)
-    numbers = scored(asked.track, played.outcome)
+    numbers = compute_scores(asked.track, played.outcome)
     return {key: episode[key] for key in ("environment", "kwargs", "seed")} | {
         "scores": {score: value for score, value in numbers.items()
-                   if value is not None and math.isfinite(value) and scores()[score].repeats},
+                   if value is not None and math.isfinite(value) and scores()[score].deterministic},
         **_answer(played)}
 
 

@@ -17,15 +17,15 @@ from typing import Any
 import numpy as np
 from scipy.stats import permutation_test
 
-from eitbench._files import shipped
+from eitbench._files import bundled_path
 from eitbench.bench.isolation import check_out_of_reach
 from eitbench.bench.methods import is_builtin
 from eitbench.bench.run import Job, run_episode
 from eitbench.bench.text import scores_by_seed
-from eitbench.bench.tracks import FLOORS
+from eitbench.bench.tracks import NAIVE_BASELINES
 from eitbench.data.seeds import SPLITS, parse_seeds
 
-COMMITMENT = shipped("leaderboards") / "held_out.json"
+COMMITMENT = bundled_path("leaderboards") / "held_out.json"
 SECRET_BYTES = 32
 SIGNIFICANCE_LEVEL = 0.05
 MIN_RATIO = 1e-12
@@ -79,7 +79,7 @@ def verify_held_out(record: dict[str, Any], job: Job, secret: bytes,
     if math.comb(episodes + len(public), episodes) < 2.0 / SIGNIFICANCE_LEVEL:
         raise ValueError("held-out and recorded episodes must be more for a test, got "
                          f"{episodes} and {len(public)}")
-    baseline = Job(job.environment, FLOORS[job.environment.track], 0)
+    baseline = Job(job.environment, NAIVE_BASELINES[job.environment.track], 0)
     seeds = held_out_seeds(secret, episodes)
     own, naive = (_errors(each, seeds) for each in (job, baseline))
     there = _errors(baseline, [parse_seeds(name)[0] for name in public])

@@ -38,8 +38,8 @@ import numpy as np
 
 from eitbench import _check
 from eitbench._files import PACKAGE
-from eitbench._foreign import cleaned, traceback_of, where_of
-from eitbench._notice import say
+from eitbench._notice import notify
+from eitbench._sanitize import error_location, sanitize, user_traceback
 from eitbench.bench.methods import (
     MAX_PARAMETERS_BYTES,
     MAX_TITLE_CHARS,
@@ -52,7 +52,7 @@ from eitbench.bench.methods import (
     is_path,
     load_method,
 )
-from eitbench.bench.tracks import BOARDS, Environment, is_measured
+from eitbench.bench.tracks import SUBTRACKS, Environment, is_measured
 from eitbench.data.cache import CACHE_VARIABLE, cache_folder, model_key
 from eitbench.worlds.random_streams import generator_from_state
 from eitbench.worlds.registry import import_entries, runtime_entries
@@ -135,7 +135,7 @@ def choose_isolation(environment: Environment, method: str, isolate: str = "auto
 
 @cache
 def _notify_of_process(method: str) -> None:
-    say(f"{method} runs in a separate process that can read your files; --isolate bubblewrap "
+    notify(f"{method} runs in a separate process that can read your files; --isolate bubblewrap "
         "confines it, --isolate none runs it in this process")
 
 
@@ -215,7 +215,7 @@ def decode_message(read: Callable[[int], bytes], max_array_bytes: int = MAX_ARRA
     position = 0
     try:
         header, layout = json.loads(head, parse_constant=_numeric)
-        _check.nesting("header", header)
+        _check.depth("header", header)
         json.dumps(header, ensure_ascii=False).encode()  # a lone surrogate cannot be stored
         for name, dtype, shape in layout:
             sizes = [_check.integer("axis", size, low=0, high=max_array_bytes) for size in shape]
@@ -319,24 +319,25 @@ def _load(key: _Key, path: Path) -> Method:
     if built_in is not None and builtin_sha256(built_in) != sha256:
         raise ValueError(f"{path} has the name of a built-in method, {about['name']}, under which "
                          "results are stored; rename it")
-    return Method(track, about["name"], about["title"], path, sha256, tuple(about["boards"]),
+    return Method(track, about["name"], about["title"], path, sha256, tuple(about["subtracks"]),
                   about["parameters"], _RemoteClass(key, lambda _: bool(about.get("suits"))),
                   about["role"])
 
 
 def _check_about(path: Path, about: dict[str, Any], track: str) -> None:
     """Raise ``ValueError`` if a worker reports attributes that no method can have."""
-    name, title, boards, role = (about.get(key) for key in ("name", "title", "boards", "role"))
+    name, title, subtracks, role = (about.get(key)
+                                    for key in ("name", "title", "subtracks", "role"))
     valid = {
-        "name": isinstance(name, str) and METHOD_NAME.fullmatch(name) and cleaned(name) == name,
+        "name": isinstance(name, str) and METHOD_NAME.fullmatch(name) and sanitize(name) == name,
         "title": (isinstance(title, str) and 0 < len(title) <= MAX_TITLE_CHARS
-                  and cleaned(title) == title),
+                  and sanitize(title) == title),
         "role": role is None or role in ROLES,
-        "boards": isinstance(boards, list) and boards and all(
-            board in BOARDS[track] for board in boards)}
+        "subtracks": isinstance(subtracks, list) and subtracks and all(
+            each in SUBTRACKS[track] for each in subtracks)}
     if wrong := [key for key, is_valid in valid.items() if not is_valid]:
         raise ValueError(f"{path} reports an invalid {', '.join(wrong)}")
-    _check.document(f"{path}: parameters", about.get("parameters"), MAX_PARAMETERS_BYTES)
+    _check.json_object(f"{path}: parameters", about.get("parameters"), MAX_PARAMETERS_BYTES)
 
 
 class Worker:
@@ -354,7 +355,7 @@ class Worker:
         self.reply_timeout = reply_timeout
         self.sha256 = ""
         """of the file that runs; empty for a built-in method"""
-        self._name = cleaned(Path(method).stem)
+        self._name = sanitize(Path(method).stem)
         self._limits = limits or Limits()
         self._left_s, self._left_chars = EPISODE_TIMEOUT_S, MAX_OUTPUT_CHARS
         self._next_check = 0.0
@@ -479,7 +480,7 @@ class Worker:
     def _show(self, printed: str) -> None:
         """Print what the method has printed, each line marked with its name."""
         if printed := printed[:self._left_chars].rstrip("\n"):
-            lines = cleaned(printed, lines=True).replace("\n", f"\n[{self._name}] ")
+            lines = sanitize(printed, lines=True).replace("\n", f"\n[{self._name}] ")
             sys.stderr.write(f"[{self._name}] {lines}\n")
         self._left_chars -= len(printed)
 
@@ -656,7 +657,7 @@ class _MethodServer:
         env: Any = gym.make(header["id"], disable_env_checker=True, **header["kwargs"]).unwrapped
         self._method = load_method(str(self._file) if self._file.name else method, header["track"])
         self._known = env.task if header["track"] == "estimation" else env.rules
-        attributes = ("name", "title", "boards", "parameters", "role", "privileged")
+        attributes = ("name", "title", "subtracks", "parameters", "role", "privileged")
         about = {name: getattr(self._method, name) for name in attributes}
         return about | {"suits": self._method.suits(self._known)}, {}
 
@@ -682,8 +683,8 @@ class _MethodServer:
     def describe(self, error: BaseException) -> dict[str, str]:
         """Return an error as the header of a reply."""
         message = f"{type(error).__name__}: {error}".replace(f"{self._file.parent}/", "")
-        found = {"error": message, "where": where_of(error, self._file),
-                 "traceback": traceback_of(error, self._file)}
+        found = {"error": message, "where": error_location(error, self._file),
+                 "traceback": user_traceback(error, self._file)}
         return {key: _sendable(value, 2000) for key, value in found.items()}
 
 

@@ -16,10 +16,10 @@ from types import ModuleType
 from typing import Any, NamedTuple
 
 from eitbench import _check
-from eitbench._files import readable, shipped
-from eitbench._foreign import where_of
-from eitbench._notice import say
-from eitbench.bench.tracks import BOARDS, TRACKS
+from eitbench._files import bundled_path, resolve_input
+from eitbench._notice import notify
+from eitbench._sanitize import error_location
+from eitbench.bench.tracks import SUBTRACKS, TRACKS
 
 METHOD_GROUP = "eitbench.methods"
 """Entry points of installed packages: a method's name, and its module of that name."""
@@ -69,7 +69,7 @@ class Method(NamedTuple):
     """First line of its docstring, up to a colon, bracket or full stop."""
     path: Path
     sha256: str
-    boards: tuple[str, ...]
+    subtracks: tuple[str, ...]
     """Boards of its track that it can run on."""
     parameters: dict[str, Any]
     make: Callable[..., Any]
@@ -95,7 +95,7 @@ class Method(NamedTuple):
 
 def baseline_folder() -> Path:
     """Return the folder of the built-in methods."""
-    return shipped("baselines")
+    return bundled_path("baselines")
 
 
 def builtin_methods(track: str) -> list[str]:
@@ -112,7 +112,7 @@ def builtin_agents(id: str) -> list[str]:
     agents = _agents(id)
     found = [str(path) for path in agents if path.is_file()]
     if agents and not found:
-        say(f"our agents for {id} are left out: {AGENTS_NOT_BUNDLED}")
+        notify(f"our agents for {id} are left out: {AGENTS_NOT_BUNDLED}")
     return found
 
 
@@ -209,14 +209,14 @@ def find_method(name: str, track: str) -> Path:
     folder = baseline_folder() / form.folder
     own = builtin_methods(track)
     if is_path(name):
-        path = readable(Path(name))
+        path = resolve_input(Path(name))
     else:
         known = installed_methods() | {each: folder / f"{each}.py" for each in own}
         path = known.get(name, Path())
     if not path.is_file():
         names = [*own, *installed_methods()]
         hint = (f": {AGENTS_NOT_BUNDLED}" if "checkpoints" in path.parts
-                else _check.nearest(name, names))
+                else _check.did_you_mean(name, names))
         raise ValueError(f"{form.kind} must be the path of {form.files}, or one of "
                          f"{', '.join(names)}; got {name!r}{hint}")
     if path.stat().st_size > MAX_METHOD_BYTES:
@@ -242,8 +242,8 @@ def _load(path: Path, source: bytes, track: str) -> Method:
     form = METHOD_KINDS[track]
     if track == "injection" and path.suffix in _loaders():
         name, title, agent, parameters = _loaders()[path.suffix].load()(path, source)
-        _check.document(f"{form.kind} {path}: parameters", parameters, MAX_PARAMETERS_BYTES)
-        return Method(track, name, title, path, sha256, BOARDS[track], parameters, agent)
+        _check.json_object(f"{form.kind} {path}: parameters", parameters, MAX_PARAMETERS_BYTES)
+        return Method(track, name, title, path, sha256, SUBTRACKS[track], parameters, agent)
     module = load_module(form.kind, path, source)
     method = getattr(module, form.type, None)
     if not isinstance(method, type):
@@ -260,9 +260,11 @@ def method_from_class(method: type[Any], track: str, name: str, where: str = "")
     who = f"{form.kind} {where or name}: {method.__name__}"
     if not callable(getattr(method, form.interface.partition("(")[0], None)):
         raise ValueError(f"{who} must have a method {form.interface}")
-    boards = tuple(getattr(method, "boards", BOARDS[track][:1]))
-    if not boards or not set(boards) <= set(BOARDS[track]):
-        raise ValueError(f"{who}.boards must be some of {', '.join(BOARDS[track])}, got {boards!r}")
+    # `boards` is the name of this attribute in older files
+    named = getattr(method, "subtracks", getattr(method, "boards", SUBTRACKS[track][:1]))
+    if not (subtracks := tuple(named)) or not set(subtracks) <= set(SUBTRACKS[track]):
+        raise ValueError(f"{who}.subtracks must be some of {', '.join(SUBTRACKS[track])}, got "
+                         f"{subtracks!r}")
     role = getattr(method, "role", None)
     if role not in ROLES:
         raise ValueError(f"{who}.role must be None, 'floor' or 'reference', got {role!r}")
@@ -271,8 +273,8 @@ def method_from_class(method: type[Any], track: str, name: str, where: str = "")
         raise ValueError(f"{who}.privileged must be True or False, got {privileged!r}")
     given = getattr(method, "parameters", {})
     parameters = dict(given) if isinstance(given, Mapping) else given
-    _check.document(f"{who}.parameters", parameters, MAX_PARAMETERS_BYTES)
-    return Method(track, name, name, Path(), "", boards, parameters, method, role, privileged)
+    _check.json_object(f"{who}.parameters", parameters, MAX_PARAMETERS_BYTES)
+    return Method(track, name, name, Path(), "", subtracks, parameters, method, role, privileged)
 
 
 def load_module(kind: str, path: Path, source: bytes) -> ModuleType:
@@ -287,7 +289,7 @@ def load_module(kind: str, path: Path, source: bytes) -> ModuleType:
         # a cached .pyc may lag behind an edit by a second
         exec(compile(source, path, "exec"), module.__dict__)
     except Exception as error:
-        where = "" if isinstance(error, SyntaxError) else f" ({where_of(error, path)})"
+        where = "" if isinstance(error, SyntaxError) else f" ({error_location(error, path)})"
         raise ValueError(f"{kind} {path} cannot be loaded: {type(error).__name__}: {error}{where}"
                          ) from error
     return module

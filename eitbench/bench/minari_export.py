@@ -9,7 +9,7 @@ import gymnasium as gym
 import numpy as np
 from tqdm import tqdm
 
-from eitbench._extras import needed_by
+from eitbench._extras import require_extra
 from eitbench.bench.methods import Method, load_method
 from eitbench.bench.runner import policy_generator
 from eitbench.bench.tracks import check_track
@@ -44,7 +44,7 @@ def export_minari(name: str, env: str, policy: str, seeds: str | Sequence[int], 
     seed, a policy
     that does not suit the environment, or a name that is malformed or taken.
     """
-    with needed_by("format minari"):
+    with require_extra("format minari"):
         from minari import create_dataset_from_buffers
     _check_name(name)
     check_track(env, "injection")

@@ -111,7 +111,7 @@ def estimation_outcome(env: EstimationEnv, said: EstimatorOutput) -> Outcome:
         env.world, float(said.seconds.sum() / task.n_steps),
         scoring.step_errors(mean, truth, mass), mean=mean, truth=truth, mass=mass,
         points=cached_truth_model(env.world).transport.mesh.points, homogeneous=homogeneous,
-        measured=said.voltages[states], computed=computed,
+        voltages_measured=said.voltages[states], voltages_predicted=computed,
         innovations=innovations, std=std, velocity=velocity)
 
 
@@ -130,15 +130,15 @@ class ScoredEstimate(NamedTuple):
 
 
 def injection_outcome(world: World, seed: int, estimates: list[ScoredEstimate],
-                      seconds_per_step: float, spent: int) -> Outcome:
-    """Return the outcome of an episode in which a policy made ``spent`` injections."""
+                      seconds_per_step: float, n_injections: int) -> Outcome:
+    """Return the outcome of an episode in which a policy made ``n_injections`` injections."""
     states, errors, means, stds, innovations = zip(*estimates, strict=True)
     interpolation, mass = region_operators(world)
     truth = simulate(world, seed, progress=False).concentration[list(states)].astype(float)
     used = [innovation for innovation in innovations if innovation is not None]
     both = [each.value for each in used], [each.covariance for each in used]
     return Outcome(
-        world, seconds_per_step, np.array(errors), spent,
+        world, seconds_per_step, np.array(errors), n_injections,
         mean=(interpolation @ np.array(means).T).T, truth=truth, mass=mass,
         points=cached_truth_model(world).transport.mesh.points,
         innovations=both if used else None, std=(interpolation @ np.array(stds).T).T)

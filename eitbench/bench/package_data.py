@@ -7,7 +7,7 @@ from collections.abc import Iterable, Iterator
 
 import numpy as np
 
-from eitbench.bench.tracks import own_ids
+from eitbench.bench.tracks import builtin_ids
 from eitbench.data.cache import PACKAGE_DATA, Arrays, File, load_shipped, ship
 from eitbench.data.episode_cache import csr_of, prefix_file, region_file, scoring_constants_file
 from eitbench.estimation.onboard.models import build_packed_model, reduced_model_key, unpack_model
@@ -50,7 +50,7 @@ def write_package_data(ids: Iterable[str] = ()) -> Iterator[tuple[str, str]]:
     name, result
         ``result`` is ``new``, ``same`` or the difference, and then the file stays as it is.
     """
-    for file in expected_files(ids or own_ids()):
+    for file in expected_files(ids or builtin_ids()):
         built = file.build()
         if not file.key.shipped_path.is_file():
             ship(file.key, built)
@@ -61,7 +61,7 @@ def write_package_data(ids: Iterable[str] = ()) -> Iterator[tuple[str, str]]:
 
 def unused_files() -> list[str]:
     """Return the names of shipped files that no built-in id needs."""
-    needed = {file.key.shipped_path.name for file in expected_files(own_ids())}
+    needed = {file.key.shipped_path.name for file in expected_files(builtin_ids())}
     return sorted(path.name for path in PACKAGE_DATA.iterdir() if path.name not in needed)
 
 

@@ -7,19 +7,19 @@ from collections.abc import Collection, Mapping
 import numpy as np
 
 from eitbench.bench.statistics import (
-    DRAWS,
+    N_RESAMPLES,
     Scores,
     Statistic,
     has_enough_episodes,
     mean_over_environments,
-    resampled,
-    tail,
+    resample,
+    tail_percent,
 )
 
 
 def shared_ranks(scores: Mapping[str, Scores], unranked: Collection[str] = (), *,
                  statistic: Statistic = mean_over_environments, higher_is_better: bool = False,
-                 draws: int = DRAWS, seed: int = 0) -> dict[str, int | None]:
+                 n_resamples: int = N_RESAMPLES, seed: int = 0) -> dict[str, int | None]:
     """Rank methods that ran on the same episodes: 1 + the number of ranked methods that are
     significantly better.
 
@@ -41,7 +41,7 @@ def shared_ranks(scores: Mapping[str, Scores], unranked: Collection[str] = (), *
         Methods without a rank that do not count for the others, such as privileged ones.
     statistic : callable
         The statistic that is compared and that orders the methods; as in `stratified_bootstrap`.
-    draws, seed
+    n_resamples, seed
         As in `stratified_bootstrap`.
 
     Returns
@@ -64,9 +64,10 @@ def shared_ranks(scores: Mapping[str, Scores], unranked: Collection[str] = (), *
     ranks: dict[str, int | None] = dict.fromkeys(order)
     if not has_enough_episodes(next(iter(strata.values()))):
         return ranks | dict.fromkeys(ranked, 1)
-    cut = tail(tuple(map(len, next(iter(strata.values())))))
+    cut = tail_percent(tuple(map(len, next(iter(strata.values())))))
     # the same resamples for all: a paired difference is that of two rows
-    drawn = {method: sign * resampled(strata[method], statistic, draws, seed) for method in ranked}
+    drawn = {method: sign * resample(strata[method], statistic, n_resamples, seed)
+             for method in ranked}
     for method in ranked:
         better = [other for other in ranked
                   if np.percentile(drawn[method] - drawn[other], cut) > 0.0]

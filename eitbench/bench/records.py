@@ -33,14 +33,14 @@ import jsonschema_rs
 import orjson
 
 from eitbench import _check
-from eitbench._files import shipped, write_atomically
-from eitbench._foreign import cleaned
+from eitbench._files import bundled_path, write_atomically
+from eitbench._sanitize import sanitize
 from eitbench.bench import tracks
-from eitbench.bench.episode_table import read_episode_table, table_beside
+from eitbench.bench.episode_table import read_episode_table, table_path
 from eitbench.data.seeds import format_seed, parse_seeds
 
 SCHEMA = 3
-BOARDS = tracks.ALL_BOARDS
+BOARDS = tracks.ALL_SUBTRACKS
 COMMON_FIELDS = ("board", "title", "parameters", "role", "privileged", "version", "method_sha256",
           "checkpoint_sha256")
 """Fields that all episodes of a record have in common, beside environment and method."""
@@ -67,7 +67,7 @@ def write_record(folder: Path, record: dict[str, Any]) -> Path:
     try:
         check_record(record)
     except ValueError as error:
-        raise ValueError(f"record {cleaned(str(path))} {cleaned(str(error))}") from None
+        raise ValueError(f"record {sanitize(str(path))} {sanitize(str(error))}") from None
     write_atomically(path, _text(record).encode())
     return path
 
@@ -88,7 +88,7 @@ def read_record(path: Path) -> dict[str, Any]:
             raise ValueError(f"must have the name {record_file_name(record)}, as its content "
                              "requires")
     except (OSError, ValueError) as error:
-        raise ValueError(f"record {cleaned(str(path))} {cleaned(str(error))}") from None
+        raise ValueError(f"record {sanitize(str(path))} {sanitize(str(error))}") from None
     return record
 
 
@@ -100,7 +100,7 @@ def read_json(path: Path) -> Any:
         if not stat.S_ISREG(status.st_mode) or status.st_size > MAX_BYTES:
             raise ValueError(f"it must be a file of at most {MAX_BYTES >> 20} MiB")
         content = orjson.loads(path.read_bytes())
-        _check.nesting("lists and objects", content, MAX_DEPTH)
+        _check.depth("lists and objects", content, MAX_DEPTH)
     except (OSError, ValueError) as error:
         raise ValueError(f"cannot be read: {error}") from None
     return content
@@ -117,7 +117,7 @@ def read_records(folder: Path, *, keep: Callable[[dict[str, Any]], Any] = dict) 
     ``ValueError``, naming all of them, if some are not valid; see `read_record`.
     """
     folder = Path(folder)
-    if not folder.is_dir() and (table := table_beside(folder)).is_file():
+    if not folder.is_dir() and (table := table_path(folder)).is_file():
         return [keep(record) for record in read_episode_table(table)]
     records, complaints = read_valid_files(folder, keep=keep)
     if complaints:
@@ -144,8 +144,8 @@ def read_valid_files(folder: Path, *, keep: Callable[[dict[str, Any]], Any] = di
         if id in known:
             kept[path] = keep(record)
         else:
-            warnings.warn(f"record {cleaned(str(path))} is left out: there is no environment "
-                          f"{cleaned(id)}", stacklevel=3)
+            warnings.warn(f"record {sanitize(str(path))} is left out: there is no environment "
+                          f"{sanitize(id)}", stacklevel=3)
     return kept, complaints
 
 
@@ -251,7 +251,7 @@ def _lineage(record: dict[str, Any]) -> tuple[str, ...]:
 
 def schema_text() -> str:
     """Return the published schema."""
-    return (shipped("leaderboards") / "schema.json").read_text(encoding="utf-8")
+    return (bundled_path("leaderboards") / "schema.json").read_text(encoding="utf-8")
 
 
 @lru_cache(maxsize=1)
@@ -297,7 +297,7 @@ def _of_the_environment(record: dict[str, Any]) -> Iterator[str]:
     environment = record["environment"]
     id = environment["id"]
     kwargs = environment["kwargs"]
-    name = tracks.named(id, kwargs)
+    name = tracks.environment_name(id, kwargs)
     if environment["name"] != name:
         yield f"$.environment.name: must be {name}, as id and kwargs require"
     if len(json.dumps(kwargs)) > MAX_KWARGS_CHARS:
@@ -305,7 +305,7 @@ def _of_the_environment(record: dict[str, Any]) -> Iterator[str]:
     if id not in tracks.ids():                        # the record will be left out
         return
     try:
-        boards = tracks.boards_of(id, kwargs)
+        boards = tracks.subtracks_of(id, kwargs)
     except ValueError as error:
         yield f"$.environment.kwargs: {error}"
         return
@@ -318,7 +318,7 @@ def _of_the_seeds(record: dict[str, Any]) -> Iterator[str]:
         yield "$.seeds: must be those of the episodes, in their order"
     for seed in record["seeds"]:
         if not _is_seed(seed):
-            yield f"$.seeds: {cleaned(seed)[:40]!r} names no episode"
+            yield f"$.seeds: {sanitize(seed)[:40]!r} names no episode"
     if {split_of(seed) for seed in record["seeds"]} != {record["split"]}:
         yield f"$.seeds: must all be of the split {record['split']}"
 

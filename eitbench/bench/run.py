@@ -17,15 +17,15 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 from tqdm import tqdm
 
-from eitbench._foreign import traceback_of, where_of
+from eitbench._sanitize import error_location, user_traceback
 from eitbench.bench import isolation
 from eitbench.bench.isolation import WorkerError, load_isolated
 from eitbench.bench.methods import Method, find_method, load_method, loader_of, version_of
 from eitbench.bench.records import COMMON_FIELDS
 from eitbench.bench.runner import cached_environment, run_method
-from eitbench.bench.scores import SCORING, scored
+from eitbench.bench.scores import SCORING, compute_scores
 from eitbench.bench.store import EpisodeStore, machine, portable_command, provenance
-from eitbench.bench.tracks import Environment, board_of, is_measured, registered
+from eitbench.bench.tracks import Environment, is_measured, registered_kwargs, subtrack_of
 from eitbench.data.cache import world_digest
 from eitbench.data.episodes import simulate
 from eitbench.data.parallel import run_parallel
@@ -78,7 +78,7 @@ class Job(NamedTuple):
 def _content_digest(id: str, changes: dict[str, Any] | None) -> str:
     """Return the digest of an environment's world with ``changes``, or of its measured case."""
     if is_measured(id):
-        return read_case(registered(id)["case"]).digest
+        return read_case(registered_kwargs(id)["case"]).digest
     return world_digest(entry(id).world.with_changes(changes))
 
 
@@ -96,7 +96,7 @@ def run_episode(job: Job) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     try:
         with threadpool_limits(1), redirect_stdout(sys.stderr):  # standard output is for tables
             played = run_method(job.environment, method, job.seed)
-            numbers = scored(method.track, played.outcome)
+            numbers = compute_scores(method.track, played.outcome)
         scores = {"scores": numbers, "step_errors": played.outcome.errors.tolist()}
         if played.actions is not None:
             scores["actions"] = played.actions
@@ -120,8 +120,8 @@ def _initial_result(job: Job, method: Method) -> dict[str, Any]:
         "identity": job.identity(), "seed": format_seed(job.seed), "method": method.name,
         **{name: getattr(method, name) for name in own}, "method_sha256": method.sha256,
         "checkpoint_sha256": method.sha256 if method.path.suffix == ".zip" else None,
-        "board": board_of(cached_environment(asked)),
-        "environment": {"id": asked.id, "name": asked.name, "kwargs": asked.given},
+        "board": subtrack_of(cached_environment(asked)),
+        "environment": {"id": asked.id, "name": asked.name, "kwargs": asked.overrides},
         "finished": _now(), "peak_memory": None, "seconds": 0.0}
 
 
@@ -135,7 +135,7 @@ def _failure_result(error: BaseException, own: Path) -> dict[str, Any]:
         return {"status": "failed", "message": str(error), "where": error.where,
                 "traceback": error.traceback}
     return {"status": "failed", "message": f"{type(error).__name__}: {error}",
-            "where": where_of(error, own), "traceback": traceback_of(error, own)}
+            "where": error_location(error, own), "traceback": user_traceback(error, own)}
 
 
 def run_jobs(jobs: list[Job], store: EpisodeStore, *, n_jobs: int = 1, backend: str = "loky",

@@ -22,7 +22,7 @@ from eitbench.bench.outcomes import (
     injection_outcome,
 )
 from eitbench.bench.scores import Outcome
-from eitbench.bench.tracks import Environment, board_of, check_track, is_measured
+from eitbench.bench.tracks import Environment, check_track, is_measured, subtrack_of
 from eitbench.data.seeds import allow_test_seeds
 from eitbench.envs.estimation import EstimationEnv
 from eitbench.envs.injection import InjectionEnv
@@ -68,7 +68,7 @@ def _cached_environment(asked: Environment, world: World | None, settings: str) 
 def is_compatible(method: Method, env: Any) -> bool:
     """Return whether an environment belongs to one of a method's boards and suits it."""
     known = env.rules if isinstance(env, InjectionEnv) else env.task
-    return board_of(env) in method.boards and method.suits(known)
+    return subtrack_of(env) in method.subtracks and method.suits(known)
 
 
 def run_method(asked: Environment, method: Method, seed: int) -> EpisodeRun:
@@ -94,9 +94,9 @@ def run_on_measurements(env: MeasuredEnv, method: str | Method, seed: int = 0, *
     """
     if isinstance(method, str):
         method = load_method(method, "estimation")
-    if "filter" not in method.boards:
+    if "filter" not in method.subtracks:
         raise ValueError("method must estimate the present state, as in filtering, got "
-                         f"{method.name} for {', '.join(method.boards)}")
+                         f"{method.name} for {', '.join(method.subtracks)}")
     env.reset(seed=seed)                            # chooses the task before the clock starts
     if not method.suits(env.task):
         raise ValueError(f"method must suit a target that {_motion(env.task)}, got {method.name}")

@@ -30,9 +30,9 @@ Scores = Mapping[str, Mapping[str, float]]
 """Environment -> seed -> score of one method."""
 Statistic = Callable[..., Any]
 """Maps one array (..., n_e) for each environment to (...), where ... are resamples."""
-DRAWS = 10_000
+N_RESAMPLES = 10_000
 """resamples"""
-FEWEST = 6
+MIN_EPISODES = 6
 """Episodes below which there is no interval: where all n differences have one sign each resample
 has it, and zero lies outside; for two equal methods that happens with probability 2^(1 − n), above
 5 % for n < 6."""
@@ -71,7 +71,8 @@ def mean_over_environments(*scores: ArrayLike) -> Any:
 
 
 def stratified_bootstrap(scores_by_stratum: Mapping[str, ArrayLike], statistic: Statistic, *,
-                         draws: int = DRAWS, seed: int = 0) -> tuple[float, float, float]:
+                         n_resamples: int = N_RESAMPLES, seed: int = 0,
+                         ) -> tuple[float, float, float]:
     """Compute a statistic and its 95 % bootstrap interval, resampling episodes within each
     environment.
 
@@ -81,16 +82,16 @@ def stratified_bootstrap(scores_by_stratum: Mapping[str, ArrayLike], statistic: 
         The numbers of episodes may differ.
     statistic : callable
         Called with one array for each environment, in the order of their names: (n_e,) for the
-        value, and once for all resamples with (draws, n_e). It must not depend on the order of
-        episodes; as `interquartile_mean` and `mean_over_environments`.
-    draws, seed : int
+        value, and once for all resamples with (n_resamples, n_e). It must not depend on the order
+        of episodes; as `interquartile_mean` and `mean_over_environments`.
+    n_resamples, seed : int
         Number of resamples, and the seed of their random stream.
 
     Returns
     -------
     value, low, high
-        With fewer than `FEWEST` episodes altogether, or fewer than two in an environment, low and
-        high are infinite.
+        With fewer than `MIN_EPISODES` episodes altogether, or fewer than two in an environment,
+        low and high are infinite.
     """
     strata = [np.sort(np.asarray(scores_by_stratum[environment], dtype=float), axis=-1)
               for environment in sorted(scores_by_stratum)]
@@ -98,12 +99,12 @@ def stratified_bootstrap(scores_by_stratum: Mapping[str, ArrayLike], statistic: 
     value = float(statistic(*strata))
     if not has_enough_episodes(strata):
         return value, -math.inf, math.inf
-    low, high = _interval(resampled(strata, statistic, draws, seed), strata)
+    low, high = _interval(resample(strata, statistic, n_resamples, seed), strata)
     return value, low, high
 
 
 def paired_difference(a: Scores, b: Scores, *, statistic: Statistic = mean_over_environments,
-                      draws: int = DRAWS, seed: int = 0) -> tuple[float, float, float]:
+                      n_resamples: int = N_RESAMPLES, seed: int = 0) -> tuple[float, float, float]:
     """Subtract a statistic of b from that of a, on the episodes that both have, with the 95 %
     interval; below zero a is lower.
 
@@ -116,7 +117,7 @@ def paired_difference(a: Scores, b: Scores, *, statistic: Statistic = mean_over_
     ----------
     a, b : environment -> seed -> score
         Seeds that only one of them has do not count.
-    statistic, draws, seed
+    statistic, n_resamples, seed
         As in `stratified_bootstrap`; so are the three numbers returned.
 
     Raises
@@ -128,14 +129,14 @@ def paired_difference(a: Scores, b: Scores, *, statistic: Statistic = mean_over_
     value = float(statistic(*ours) - statistic(*theirs))
     if not has_enough_episodes(ours):
         return value, -math.inf, math.inf
-    differences = (resampled(ours, statistic, draws, seed)
-                   - resampled(theirs, statistic, draws, seed))
+    differences = (resample(ours, statistic, n_resamples, seed)
+                   - resample(theirs, statistic, n_resamples, seed))
     low, high = _interval(differences, ours)
     return value, low, high
 
 
 def paired_probability_of_improvement(a: Scores, b: Scores, *, higher_is_better: bool = False,
-                                      draws: int = DRAWS, seed: int = 0,
+                                      n_resamples: int = N_RESAMPLES, seed: int = 0,
                                       ) -> tuple[float, float, float]:
     """Compute the fraction of the shared episodes in which a is better than b, with its 95 %
     interval; an equal score counts ½.
@@ -146,36 +147,37 @@ def paired_probability_of_improvement(a: Scores, b: Scores, *, higher_is_better:
     sign = 1.0 if higher_is_better else -1.0
     wins = {str(i): 0.5 * (1.0 + sign * np.sign(ours - theirs))
             for i, (ours, theirs) in enumerate(zip(*_shared(a, b), strict=True))}
-    value, low, high = stratified_bootstrap(wins, mean_over_environments, draws=draws, seed=seed)
+    value, low, high = stratified_bootstrap(wins, mean_over_environments,
+                                            n_resamples=n_resamples, seed=seed)
     return value, max(low, 0.0), min(high, 1.0)
 
 
-def resampled(strata: Sequence[np.ndarray], statistic: Statistic, draws: int,
+def resample(strata: Sequence[np.ndarray], statistic: Statistic, n_resamples: int,
               seed: int) -> np.ndarray:
-    """Compute a statistic of resamples of each stratum (n_e,): (draws,)."""
-    if draws < 1:
-        raise ValueError(f"draws must be at least 1, got {draws}")
-    positions = _positions(tuple(map(len, strata)), draws, seed)
+    """Compute a statistic of resamples of each stratum (n_e,): (n_resamples,)."""
+    if n_resamples < 1:
+        raise ValueError(f"n_resamples must be at least 1, got {n_resamples}")
+    positions = _positions(tuple(map(len, strata)), n_resamples, seed)
     values = np.asarray(statistic(*(stratum[drawn] for stratum, drawn
                                     in zip(strata, positions, strict=True))))
-    if values.shape != (draws,):  # np.mean, say, would make one number of all resamples
+    if values.shape != (n_resamples,):  # np.mean, say, would make one number of all resamples
         raise ValueError("statistic must reduce the last axis only: expected shape "
-                         f"{(draws,)}, got {values.shape}")
+                         f"{(n_resamples,)}, got {values.shape}")
     return values
 
 
 @lru_cache(maxsize=4)
-def _positions(sizes: tuple[int, ...], draws: int, seed: int) -> tuple[np.ndarray, ...]:
-    """Draw the episodes of each resample: (draws, n_e) for each stratum of n_e episodes."""
+def _positions(sizes: tuple[int, ...], n_resamples: int, seed: int) -> tuple[np.ndarray, ...]:
+    """Draw the episodes of each resample: (n_resamples, n_e) for each stratum of n_e episodes."""
     random = np.random.default_rng(seed)
-    positions = tuple(random.integers(n, size=(draws, n)) for n in sizes)
+    positions = tuple(random.integers(n, size=(n_resamples, n)) for n in sizes)
     for each in positions:
         each.setflags(write=False)
     return positions
 
 
 @lru_cache(maxsize=256)
-def tail(sizes: tuple[int, ...]) -> float:
+def tail_percent(sizes: tuple[int, ...]) -> float:
     """Compute the percentage of the resamples to leave out at each end for an interval of 95 %,
     from the number of episodes in each stratum.
 
@@ -189,17 +191,17 @@ def tail(sizes: tuple[int, ...]) -> float:
 
 
 def _interval(values: np.ndarray, strata: Sequence[np.ndarray]) -> tuple[float, float]:
-    """Compute the ends of the interval of resampled values (draws,) of these strata."""
-    cut = tail(tuple(map(len, strata)))
+    """Compute the ends of the interval of resampled values (n_resamples,) of these strata."""
+    cut = tail_percent(tuple(map(len, strata)))
     # one interpolation for both ends, so that the ends for −values are the exact negatives
     below, above = (np.percentile(side, cut) for side in (values, -values))
     return float(below), 0.0 - float(above)
 
 
 def has_enough_episodes(strata: Sequence[np.ndarray]) -> bool:
-    """Return whether strata (n_e,) have an interval: `FEWEST` episodes, and two in each."""
+    """Return whether strata (n_e,) have an interval: `MIN_EPISODES` episodes, and two in each."""
     sizes = list(map(len, strata))
-    return min(sizes) >= 2 and sum(sizes) >= FEWEST
+    return min(sizes) >= 2 and sum(sizes) >= MIN_EPISODES
 
 
 def _check_strata(name: str, strata: Sequence[np.ndarray]) -> None:

@@ -22,7 +22,7 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from eitbench._files import PACKAGE, write_atomically
-from eitbench._foreign import cleaned
+from eitbench._sanitize import sanitize
 from eitbench.bench.records import (
     COMMON_FIELDS,
     SCHEMA,
@@ -87,7 +87,7 @@ class EpisodeStore:
             try:
                 yield _read(path)
             except ValueError as error:
-                warnings.warn(f"{cleaned(str(path))} is left out: it {error}", stacklevel=2)
+                warnings.warn(f"{sanitize(str(path))} is left out: it {error}", stacklevel=2)
 
     def tracebacks(self, record: dict[str, Any]) -> dict[str, str]:
         """Map the seed of each failed episode to the lines of the method's code that led to it."""

@@ -21,13 +21,13 @@ from eitbench.bench.methods import (
 from eitbench.bench.run import Job
 from eitbench.bench.runner import is_compatible
 from eitbench.bench.tracks import (
-    ESTIMATORS,
-    QUICK,
+    ONBOARD_FILTERS,
+    QUICK_IDS,
     Environment,
-    board_of,
     check_track,
     default_seeds,
     ids,
+    subtrack_of,
 )
 
 TOO_SLOW_FOR_QUICK = {("filter", "gauss_newton")}
@@ -47,14 +47,15 @@ def make_jobs(track: str, environments: list[str], methods: list[str],
     `isolation.choose_isolation`. ``ValueError`` if there is no such environment or method, a named
     method suits none of the environments, or two have one name.
     """
-    if estimator not in ESTIMATORS:
-        raise ValueError(f"estimator must be one of {', '.join(ESTIMATORS)}, got {estimator!r}")
+    if estimator not in ONBOARD_FILTERS:
+        raise ValueError(f"estimator must be one of {', '.join(ONBOARD_FILTERS)}, got "
+                         f"{estimator!r}")
     given = {} if estimator == "full" else {"estimator": estimator}
     for method in methods:
         find_method(method, track)
     if not environments:
         quick = track == "estimation" and suite == "quick"
-        environments = list(QUICK) if quick else ids(track)
+        environments = list(QUICK_IDS) if quick else ids(track)
     todo = []
     names = dict[str, str]()
     fitting = set[str]()
@@ -62,7 +63,7 @@ def make_jobs(track: str, environments: list[str], methods: list[str],
         check_track(id, track)
         asked = Environment(id, json.dumps(given | ({"world": changes} if changes else {})))
         env = _probe_environment(asked)
-        board = board_of(env)
+        board = subtrack_of(env)
         numbers = default_seeds(id, suite) if seeds is None else seeds
         # Environment by environment, since models are kept for a few only, and a worker
         # serves one method.

@@ -8,10 +8,10 @@ from typing import NamedTuple
 
 from markupsafe import Markup
 
-from eitbench._foreign import as_markdown
-from eitbench.bench.text import mean_and_interval, number, rounded
+from eitbench._sanitize import escape_markdown
+from eitbench.bench.text import format_mean, format_number, mean_and_interval
 
-NOTHING = "–"
+MISSING = "–"
 
 
 class Cell(NamedTuple):
@@ -22,14 +22,14 @@ class Cell(NamedTuple):
     """Sorting key; None comes last. Words have a text, numbers a number."""
     picture: Markup = Markup()
     link: str = ""
-    small: str = ""
+    note: str = ""
     """Secondary text."""
     badges: tuple[str, ...] = ()
 
     @property
-    def plain(self) -> str:
+    def plain_text(self) -> str:
         """All text of the cell."""
-        text = " ".join(filter(None, [self.text, self.small]))
+        text = " ".join(filter(None, [self.text, self.note]))
         return text + (f" ({', '.join(self.badges)})" if self.badges else "")
 
 
@@ -39,7 +39,7 @@ class Row(NamedTuple):
     cells: list[Cell]
     flags: str = ""
     """Words for the filters of a page, separated by spaces."""
-    parts: tuple[Row, ...] = ()
+    children: tuple[Row, ...] = ()
     """Lines that it summarises, collapsed at first."""
 
 
@@ -58,16 +58,16 @@ class Table(NamedTuple):
         made = [{heading: cell if isinstance(cell, Cell) else Cell(cell, cell)
                  for heading, cell in row.items()} for row in rows]
         headings = [heading for heading in (made[0] if made else ())
-                    if heading in keep or any(row[heading].plain != NOTHING for row in made)]
+                    if heading in keep or any(row[heading].plain_text != MISSING for row in made)]
         return cls(headings, [Row([row[heading] for heading in headings], flags[i] if flags else "")
                               for i, row in enumerate(made)], label)
 
     @property
-    def kinds(self) -> list[str]:
+    def column_styles(self) -> list[str]:
         """Style of each column: ``drawn`` intervals, ``words``, or numbers, which is empty."""
         return [_kind([row.cells[i] for row in self.rows]) for i in range(len(self.headings))]
 
-    def fitted(self, width: int, order: Sequence[str] = ()) -> Table:
+    def fit_width(self, width: int, order: Sequence[str] = ()) -> Table:
         """Return the table with as many columns as lines of ``width`` characters hold.
 
         Columns that are not in ``order`` go first, then the last in ``order``; its first stays.
@@ -85,17 +85,17 @@ class Table(NamedTuple):
             table = Table(table.headings[:i] + table.headings[i + 1:], rows, table.label)
         return table
 
-    def left_out(self, fitted: Table) -> str:
+    def omitted_columns(self, fitted: Table) -> str:
         """Return a line that names the columns that a `fitted` table lacks, or nothing."""
         missing = [heading for heading in self.headings if heading not in fitted.headings]
         return f"no room for {', '.join(missing)}" if missing else ""
 
     def markdown(self) -> str:
         """Return aligned Markdown."""
-        texts = [self.headings, *([cell.plain for cell in row.cells] for row in self.rows)]
-        lines = [[as_markdown(text) for text in line] for line in texts]
+        texts = [self.headings, *([cell.plain_text for cell in row.cells] for row in self.rows)]
+        lines = [[escape_markdown(text) for text in line] for line in texts]
         widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
-        words = [kind == "words" for kind in self.kinds]
+        words = [kind == "words" for kind in self.column_styles]
 
         def padded(line: list[str]) -> str:
             cells = (text.ljust(width) if left else text.rjust(width)
@@ -108,17 +108,19 @@ class Table(NamedTuple):
 
 
 def number_cell(value: float | None) -> Cell:
-    """Return the cell of a number, `NOTHING` for None and NaN."""
-    return Cell(NOTHING) if value is None or value != value else Cell(number(value), float(value))
+    """Return the cell of a number, `MISSING` for None and NaN."""
+    if value is None or value != value:
+        return Cell(MISSING)
+    return Cell(format_number(value), float(value))
 
 
 def mean_cell(values: Iterable[float]) -> Cell:
-    """Return the cell of a mean ± half its 95 % interval, `NOTHING` without values."""
+    """Return the cell of a mean ± half its 95 % interval, `MISSING` without values."""
     known = list(values)
     if not known:
-        return Cell(NOTHING)
+        return Cell(MISSING)
     mean, half = mean_and_interval(known)
-    return Cell(rounded(mean, half), mean)
+    return Cell(format_mean(mean, half), mean)
 
 
 def _kind(column: list[Cell]) -> str:

@@ -22,13 +22,13 @@ def mean_and_interval(values: list[float]) -> tuple[float, float]:
     return mean, float(student.ppf(0.975, n - 1) * np.std(values, ddof=1) / math.sqrt(n))
 
 
-def rounded(mean: float, half: float) -> str:
+def format_mean(mean: float, half: float) -> str:
     """``0.0053 ± 0.0004``: one digit of the interval (two if that is a 1), the mean likewise."""
     place = _places(half)
     return f"{mean:.3g}" if place is None else f"{mean:z.{place}f} ± {half:.{place}f}"
 
 
-def with_interval(value: float, low: float, high: float) -> str:
+def format_interval(value: float, low: float, high: float) -> str:
     """``0.0053 (0.0049 to 0.0058)``, rounded by half the interval; without one, the value."""
     place = _places(0.5 * (high - low))
     if place is None:
@@ -56,7 +56,7 @@ def scores_by_seed(record: dict[str, Any], name: str) -> dict[str, float]:
     return {seed: value * factor for seed, value in values.items() if value is not None}
 
 
-def number(value: float) -> str:
+def format_number(value: float) -> str:
     """Return two digits below 1, three above, and all before the point."""
     if abs(value) >= 999.5:
         return f"{value:.0f}"

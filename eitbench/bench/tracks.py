@@ -19,19 +19,19 @@ if TYPE_CHECKING:
 
 TRACKS = ("estimation", "injection")
 """Tasks: an estimate of every state, or the next injection."""
-BOARDS = {"estimation": ("filter", "fixed-lag", "smoothing"), "injection": ("injection",)}
+SUBTRACKS = {"estimation": ("filter", "fixed-lag", "smoothing"), "injection": ("injection",)}
 """Boards of each track; in estimation they differ in the lag of an estimate."""
-ALL_BOARDS = tuple(board for boards in BOARDS.values() for board in boards)
-CLASSES = ("filter", "fixed-lag", "smoothing", "stationary", "injection")
+ALL_SUBTRACKS = tuple(board for boards in SUBTRACKS.values() for board in boards)
+CATEGORIES = ("filter", "fixed-lag", "smoothing", "stationary", "injection")
 """Groups of environments that are ranked together: the boards, and stationary targets apart."""
-FLOORS = {"estimation": "homogeneous", "injection": "random_pair"}
+NAIVE_BASELINES = {"estimation": "homogeneous", "injection": "random_pair"}
 """Naive baselines: their episodes are those of the board, and the gain is relative to them."""
-ARGUMENTS = {
+ENV_KWARGS = {
     "estimation": ("world", "lag", "assume", "episodes", "render_mode"),
     "injection": ("world", "estimator", "observation", "gate", "inflow", "episodes",
                   "render_mode")}
 """Arguments of the environments of each track."""
-ESTIMATORS = ("full", "reduced")
+ONBOARD_FILTERS = ("full", "reduced")
 """Filters inside an injection environment: the exact one, for scores, or that of training."""
 
 MEASURED = "eitbench.envs.measured:case_env"
@@ -40,12 +40,12 @@ MEASURED_FILES = "eitbench-Measured-"
 """Beginning of the names of their records."""
 MEASURED_SEEDS = "test:0-4"
 """Each withholds other readings of the same measurements."""
-QUICK = ("eitbench/Pipe2D-v0", "eitbench/Pipe2DFixedLag-v0", "eitbench/Pipe2DSmoothing-v0")
+QUICK_IDS = ("eitbench/Pipe2D-v0", "eitbench/Pipe2DFixedLag-v0", "eitbench/Pipe2DSmoothing-v0")
 """Environments of the quick suite; the full one has all of the track estimation."""
 QUICK_SEEDS = "test:0-3"
 
 
-SCORED = {"estimation": {}, "injection": {"estimator": "full", "observation": "raw"}}
+RUN_KWARGS = {"estimation": {}, "injection": {"estimator": "full", "observation": "raw"}}
 """Default arguments of each track's environments in runs: with the exact filter and unscaled
 observations. In training, registered ids have other defaults."""
 
@@ -58,14 +58,14 @@ class Environment(NamedTuple):
     """JSON"""
 
     @property
-    def given(self) -> dict[str, Any]:
+    def overrides(self) -> dict[str, Any]:
         """Return the arguments that differ from the registered ones."""
-        return changed(self.id, json.loads(self.kwargs))
+        return nondefault_kwargs(self.id, json.loads(self.kwargs))
 
     @property
     def name(self) -> str:
         """Return a name for folders, which differs where arguments differ."""
-        return named(self.id, self.given)
+        return environment_name(self.id, self.overrides)
 
     @property
     def track(self) -> str:
@@ -78,14 +78,15 @@ class Environment(NamedTuple):
         creator = load_env_creator(str(gym.spec(self.id).entry_point))
         defaults = {name: each.default for name, each in signature(creator).parameters.items()
                     if each.default is not Parameter.empty and name != "variant"}
-        return defaults | registered(self.id) | SCORED[self.track] | json.loads(self.kwargs)
+        return (defaults | registered_kwargs(self.id) | RUN_KWARGS[self.track]
+                | json.loads(self.kwargs))
 
     def make(self, **extra: Any) -> EstimationEnv | InjectionEnv:
         """Make the environment without gymnasium's wrappers; ``ValueError`` if there is none of
         this id, or its arguments are wrong."""
-        arguments = SCORED[self.track] | json.loads(self.kwargs) | extra
-        if arguments.get("estimator", "full") not in ESTIMATORS:
-            raise ValueError(f"estimator must be one of {', '.join(ESTIMATORS)}, got "
+        arguments = RUN_KWARGS[self.track] | json.loads(self.kwargs) | extra
+        if arguments.get("estimator", "full") not in ONBOARD_FILTERS:
+            raise ValueError(f"estimator must be one of {', '.join(ONBOARD_FILTERS)}, got "
                              f"{arguments['estimator']!r}")
         made: Any = gym.make(self.id, disable_env_checker=True, **arguments).unwrapped
         return made
@@ -106,7 +107,7 @@ def is_measured(id: str) -> bool:
     return id in gym.registry and gym.registry[id].entry_point == MEASURED
 
 
-def own_ids() -> list[str]:
+def builtin_ids() -> list[str]:
     """Return the built-in ids."""
     return [id for id in ids() if id.startswith("eitbench/")]
 
@@ -116,7 +117,7 @@ def track_of(id: str) -> str:
     return "estimation" if is_measured(id) else entry(id).track
 
 
-def home_of(id: str) -> str:
+def nominal_id(id: str) -> str:
     """Return the id of which this one is a shifted variant, with the same task; else empty."""
     return "" if is_measured(id) else entry(id).nominal
 
@@ -129,22 +130,22 @@ def check_track(id: str, track: str) -> None:
                          f"{', '.join(ids(track))}")
 
 
-def registered(id: str) -> dict[str, Any]:
+def registered_kwargs(id: str) -> dict[str, Any]:
     """Return the arguments that an id was registered with; none if it is not registered."""
     each = entries().get(id)
     if each is None:
         return dict(gym.registry[id].kwargs) if is_measured(id) else {}
-    return SCORED[each.track] | dict(each.settings)
+    return RUN_KWARGS[each.track] | dict(each.settings)
 
 
-def changed(id: str, kwargs: dict[str, Any]) -> dict[str, Any]:
+def nondefault_kwargs(id: str, kwargs: dict[str, Any]) -> dict[str, Any]:
     """Select the arguments that differ from the registered ones."""
-    usual = {"world": {}} | registered(id)
+    usual = {"world": {}} | registered_kwargs(id)
     return {key: value for key, value in kwargs.items() if value is not None
             and (key not in usual or json.dumps(value) != json.dumps(usual[key]))}
 
 
-def named(id: str, given: dict[str, Any]) -> str:
+def environment_name(id: str, given: dict[str, Any]) -> str:
     """Return the name of an id with the arguments that differ from the registered ones."""
     text = json.dumps(given, sort_keys=True)
     digest = hashlib.sha256(text.encode()).hexdigest()[:8]
@@ -158,8 +159,8 @@ def record_name(environment: str, method: str, version: str, split: str) -> str:
     return "--".join(parts) + ".json"
 
 
-def board_of(env: EstimationEnv | InjectionEnv) -> str:
-    """Return the board of an environment, one of its track's `BOARDS`."""
+def subtrack_of(env: EstimationEnv | InjectionEnv) -> str:
+    """Return the board of an environment, one of its track's `SUBTRACKS`."""
     lag = getattr(env, "lag", None)
     if lag is None:
         return "injection"
@@ -168,19 +169,19 @@ def board_of(env: EstimationEnv | InjectionEnv) -> str:
     return "smoothing" if lag == env.world.n_steps - 1 else "fixed-lag"
 
 
-def boards_of(id: str, kwargs: dict[str, Any]) -> tuple[str, ...]:
+def subtracks_of(id: str, kwargs: dict[str, Any]) -> tuple[str, ...]:
     """Return the boards that a registered id with these arguments may belong to, without making it:
     one, or two where that depends on a changed world. ``ValueError`` if it has no such arguments.
     """
     track = track_of(id)
     for name, value in kwargs.items():
-        if name not in ARGUMENTS[track]:
+        if name not in ENV_KWARGS[track]:
             raise ValueError(f"{name} is no argument of {id}; there are "
-                             f"{', '.join(ARGUMENTS[track])}")
+                             f"{', '.join(ENV_KWARGS[track])}")
         if name in ("world", "assume") and not isinstance(value, dict | None):
             raise ValueError(f"{name} must be an object, got {type(value).__name__}")
     if track == "injection":
-        return BOARDS[track]
+        return SUBTRACKS[track]
     each = entry(id)
     lag = kwargs.get("lag")
     if lag is None:
@@ -196,13 +197,13 @@ def boards_of(id: str, kwargs: dict[str, Any]) -> tuple[str, ...]:
     return ("smoothing",) if lag == each.world.n_steps - 1 else ("fixed-lag",)
 
 
-def track_of_board(board: str) -> str:
+def track_of_subtrack(board: str) -> str:
     """Return the track of a board."""
-    return next(track for track, boards in BOARDS.items() if board in boards)
+    return next(track for track, boards in SUBTRACKS.items() if board in boards)
 
 
-def class_of(id: str, board: str) -> str:
-    """Return the one of `CLASSES` of an environment's board; ``measured`` for a case."""
+def category_of(id: str, board: str) -> str:
+    """Return the one of `CATEGORIES` of an environment's board; ``measured`` for a case."""
     if is_measured(id):
         return "measured"
     each = entries().get(id)

@@ -24,25 +24,25 @@ def variants(settings: Iterable[str]) -> list[dict[str, Any]]:
                for other in chosen):
             raise ValueError(f"set must name each number once, got {path!r} again")
         values = _values(text)
-        if "" in values or len({as_typed(value) for value in values}) < len(values):
+        if "" in values or len({format_setting(value) for value in values}) < len(values):
             raise ValueError(f"set must give different values, none of them empty, got {setting!r}")
         chosen[path] = values
     return [_nested(zip(chosen, values, strict=True))
             for values in itertools.product(*chosen.values())]
 
 
-def flat(changes: dict[str, Any]) -> dict[str, Any]:
+def flatten(changes: dict[str, Any]) -> dict[str, Any]:
     """``{"instrument": {"noise_relative": 0.02}}`` -> ``{"instrument.noise_relative": 0.02}``."""
     found: dict[str, Any] = {}
     for key, value in changes.items():
         if isinstance(value, dict):
-            found |= {f"{key}.{inner}": each for inner, each in flat(value).items()}
+            found |= {f"{key}.{inner}": each for inner, each in flatten(value).items()}
         else:
             found[key] = value
     return found
 
 
-def as_typed(value: Any) -> str:
+def format_setting(value: Any) -> str:
     """Return a value as in a setting: words without quotation marks."""
     return value if isinstance(value, str) else json.dumps(value)
 

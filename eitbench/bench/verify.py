@@ -34,7 +34,7 @@ from eitbench.bench.records import (
 )
 from eitbench.bench.run import Job, run_jobs
 from eitbench.bench.runner import run_method
-from eitbench.bench.scores import scored, scores
+from eitbench.bench.scores import compute_scores, scores
 from eitbench.bench.store import EpisodeStore
 from eitbench.bench.table import Cell, Table
 from eitbench.bench.text import scores_by_seed
@@ -279,7 +279,7 @@ def replay_actions(record: dict[str, Any], recorded: dict[str, Any]) -> dict[str
     replay = Method("injection", record["method"], record["title"], Path(), "",
                     (record["board"],), {}, lambda *_: _Replay(actions))
     outcome = run_method(environment, replay, parse_seeds(recorded["seed"])[0]).outcome
-    return {"status": "ok", "scores": scored("injection", outcome),
+    return {"status": "ok", "scores": compute_scores("injection", outcome),
             "step_errors": outcome.errors.tolist()}
 
 
@@ -306,7 +306,7 @@ def score_differences(recorded: dict[str, Any], result: dict[str, Any]) -> dict[
         return {}
     found = {name: _relative([value], [result["scores"].get(name)])
              for name, value in sorted(recorded["scores"].items())
-             if name not in known or known[name].repeats}
+             if name not in known or known[name].deterministic}
     return found | {"step_errors": _relative(recorded["step_errors"], result["step_errors"])}
 
 

@@ -2,13 +2,13 @@
 
 import sys
 
-from eitbench._extras import needed_by
+from eitbench._extras import require_extra
 
 
 def main() -> None:
     """Run the command, or say what it needs to be installed."""
     try:
-        with needed_by("the command eitbench"):
+        with require_extra("the command eitbench"):
             from eitbench.cli.app import app
     except ModuleNotFoundError as error:
         sys.exit(str(error))

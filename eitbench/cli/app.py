@@ -11,7 +11,7 @@ import typer
 from eitbench import __version__
 from eitbench.cli import learn, options
 from eitbench.cli.estimate import estimate
-from eitbench.cli.run import report, run, typed
+from eitbench.cli.run import command_line, print_report, run
 from eitbench.cli.verify import verify
 
 app = typer.Typer(no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False,
@@ -25,7 +25,7 @@ writes results/index.html.
 
 def _say_version(asked: bool) -> None:
     if asked:
-        options.say(f"eitbench {__version__}")
+        options.echo(f"eitbench {__version__}")
         raise typer.Exit
 
 
@@ -41,7 +41,7 @@ def _main(
 def list_() -> None:
     """Show the environments, the baselines and policies, and which boards they play on."""
     from eitbench.bench.methods import builtin_methods, load_method
-    from eitbench.bench.tracks import boards_of, ids, measured_ids
+    from eitbench.bench.tracks import ids, measured_ids, subtracks_of
     from eitbench.worlds.registry import GROUPS, entry
     from eitbench.worlds.task import lag_steps
     lines = []
@@ -58,17 +58,17 @@ def list_() -> None:
             if each.nominal:
                 about += f", variant {each.variant} of {each.nominal}"
             about += ", starting point" * each.is_starting_point
-            lines.append((f"  {name}", boards_of(name, {})[0], about))
+            lines.append((f"  {name}", subtracks_of(name, {})[0], about))
     lines.append(("environments: measured data", "", ""))
     lines += [(f"  {name}", "measured", "data are downloaded separately")
               for name in measured_ids()]
     for track, heading in (("estimation", "baselines"), ("injection", "policies")):
         lines.append((heading, "", ""))
         methods = {name: load_method(name, track) for name in builtin_methods(track)}
-        lines += [(f"  {name}", ", ".join(method.boards), method.title)
+        lines += [(f"  {name}", ", ".join(method.subtracks), method.title)
                   for name, method in methods.items()]
     for name, boards, about in lines:
-        options.say(f"{name:42} {boards:30}  {about}".rstrip())
+        options.echo(f"{name:42} {boards:30}  {about}".rstrip())
 
 
 app.command()(run)
@@ -100,16 +100,16 @@ def submit(
     from eitbench.bench.records import read_record
     from eitbench.bench.store import EpisodeStore
     from eitbench.bench.submit import submit
-    with options.clear_errors():
+    with options.cli_errors():
         if baseline and policy:
             raise ValueError("one of --baseline and --policy may be given, got both")
-        seeds_asked = options.numbers(seeds)
+        seeds_asked = options.parse_episodes(seeds)
         for path in submit(baseline or policy, env or [], seeds_asked, EpisodeStore(out), to,
                            policy=policy is not None, official=official, isolate=isolate,
-                           n_jobs=jobs, backend=backend, command=typed()):
+                           n_jobs=jobs, backend=backend, command=command_line()):
             episodes = read_record(path)["episodes"]
             failed = sum(episode["status"] != "ok" for episode in episodes)
-            options.say(f"wrote {path}: {len(episodes)} episodes"
+            options.echo(f"wrote {path}: {len(episodes)} episodes"
                         + (f", {failed} failed" if failed else ""))
 
 
@@ -130,14 +130,14 @@ def golden(
     """
     from eitbench.bench import golden
     any_moved = False
-    with options.clear_errors():
+    with options.cli_errors():
         for name, status, differences in golden.update(names or [], new_version=new_version):
             any_moved |= status == "moved"
-            options.say(f"{name}: {status}")
+            options.echo(f"{name}: {status}")
             for difference in differences:
-                options.say(f"  {difference}", err=status == "moved")
+                options.echo(f"  {difference}", err=status == "moved")
     if any_moved:
-        options.say("numbers have moved: find the cause; or give the world the next -vN, or write "
+        options.echo("numbers have moved: find the cause; or give the world the next -vN, or write "
                     "the method's next version with --new-version and run its records again",
                     err=True)
         raise typer.Exit(1)
@@ -162,14 +162,14 @@ def leaderboard(
     is valid nothing is written.
     """
     if records is None:
-        with options.clear_errors():
-            return report(out)
+        with options.cli_errors():
+            return print_report(out)
     from eitbench._files import write_atomically
-    from eitbench.bench.episode_table import table_beside, write_episode_table
+    from eitbench.bench.episode_table import table_path, write_episode_table
     from eitbench.bench.records import read_valid_files
     from eitbench.report.boards import read_leaderboard_records
     from eitbench.report.site import collect, render, render_site, write_site
-    with options.clear_errors():
+    with options.cli_errors():
         found, complaints = read_leaderboard_records(records)
         out = records.parent
         site = collect(found, out)
@@ -178,12 +178,12 @@ def leaderboard(
         write_site(out / "site", render_site(site))
     for name, text in texts.items():
         write_atomically(out / name, text.encode())
-        options.say(f"wrote {out / name}")
-    options.say(f"wrote {out / 'site' / 'index.html'}")
-    write_episode_table(read_valid_files(records)[0].values(), table_beside(records))
-    options.say(f"wrote {table_beside(records)}")
+        options.echo(f"wrote {out / name}")
+    options.echo(f"wrote {out / 'site' / 'index.html'}")
+    write_episode_table(read_valid_files(records)[0].values(), table_path(records))
+    options.echo(f"wrote {table_path(records)}")
     for complaint in complaints:
-        options.say(f"left out: {complaint}", err=True)
+        options.echo(f"left out: {complaint}", err=True)
     raise typer.Exit(bool(complaints))
 
 
@@ -198,12 +198,12 @@ def compare(
     """Compare two methods seed by seed: differences with intervals, and how often the first is
     better; over several environments by gains, as on the boards."""
     from eitbench.report import compare as comparison
-    with options.clear_errors():
+    with options.cli_errors():
         ours, theirs = (comparison.find_records(name, records) for name in (a, b))
         table = comparison.compare(ours, theirs, score, comparison.naive_baseline_records(records))
     names = comparison.display_names(ours[0], theirs[0])
     width = shutil.get_terminal_size().columns
-    options.say(comparison.format_comparison(table, *names, score, width))
+    options.echo(comparison.format_comparison(table, *names, score, width))
 
 
 @app.command()
@@ -225,12 +225,12 @@ def render(
     """Draw an episode: truth, estimate, its spread, electrodes; of several baselines estimates."""
     from eitbench.bench.tracks import track_of
     from eitbench.report.animate import animate
-    with options.clear_errors():
+    with options.cli_errors():
         if track_of(env) == "injection" and policy is None:
             raise ValueError(f"policy must be given for {env}, which asks for injections")
         animate(env, [policy] if policy else baseline or ["kalman_filter"], seed, step, out,
                 every=every, isolate=isolate)
-        options.say(f"wrote {out}")
+        options.echo(f"wrote {out}")
 
 
 REPLACED = {
@@ -245,7 +245,7 @@ REPLACED = {
 def removed(context: typer.Context) -> None:
     """Print what replaces a removed command."""
     name = str(context.info_name)
-    options.say(f"`eitbench {name}` was removed: use `{REPLACED[name]}`", err=True)
+    options.echo(f"`eitbench {name}` was removed: use `{REPLACED[name]}`", err=True)
     raise typer.Exit(2)
 
 

@@ -52,13 +52,13 @@ def estimate(
     from eitbench.measured import read
     from eitbench.measured.segmentation import read_truth, require_round_tank
     from eitbench.report.measured import write_report
-    with options.clear_errors():
+    with options.cli_errors():
         if out.suffix != ".html":
             raise ValueError(f"--out must end in .html, got {out}")
         measurements = read(file, format, None if span is None else _steps(span),
                             **_reader_options(option or []))
         T, M = measurements.voltages.shape
-        options.say(f"{file}: {T} times {M} readings of {measurements.currents.shape[1]} "
+        options.echo(f"{file}: {T} times {M} readings of {measurements.currents.shape[1]} "
                     f"electrodes; a method takes about {10 + 0.03 * T:.0f} s")
         env = MeasuredEnv(measurements, vessel, withheld=withheld, moves=False if still else None,
                           correction=correction, homogeneous_frames=homogeneous_frames)
@@ -66,7 +66,7 @@ def estimate(
         if mask is not None:
             require_round_tank(env.vessel)
         for warning in env.quality_warnings():
-            options.say(f"warning: {warning}", err=True)
+            options.echo(f"warning: {warning}", err=True)
         runs = []
         for name in baseline:
             kept = plotted_steps(env) if arrays is None else None
@@ -74,17 +74,17 @@ def estimate(
             runs.append(run)
             score = ("no measurement is withheld, so nothing is scored" if not env.withheld
                      else f"withheld RMSE {run.withheld_rmse:.2f} noise std")
-            options.say(f"{run.method}: {score}")
+            options.echo(f"{run.method}: {score}")
             if run.velocity is not None:
                 velocity = ", ".join(f"{each:.3g}" for each in run.velocity[-1])
-                options.say(f"  mean velocity at the end {velocity} m/s")
+                options.echo(f"  mean velocity at the end {velocity} m/s")
             if mask is not None:
-                options.say(f"  {_truth_scores(env, run, mask)}")
+                options.echo(f"  {_truth_scores(env, run, mask)}")
         write_report(out, env, runs, mask)
-        options.say(f"wrote {out}")
+        options.echo(f"wrote {out}")
         if arrays is not None:
             runs[0].save(arrays, env)
-            options.say(f"wrote {arrays}")
+            options.echo(f"wrote {arrays}")
 
 
 def _reader_options(texts: list[str]) -> dict[str, float | str]:

@@ -34,7 +34,7 @@ def bank(
     from eitbench.data.presimulation import cached_episode_bytes, missing_seeds, presimulate
     from eitbench.data.seeds import parse_seeds
     from eitbench.worlds.registry import entry
-    with options.clear_errors():
+    with options.cli_errors():
         numbers = parse_seeds(seeds)
         world = entry(env).world
     place = folder(world)
@@ -44,15 +44,15 @@ def bank(
     except OSError as error:
         raise typer.BadParameter(f"recordings cannot be kept in {place}: {error}") from error
     missing = len(missing_seeds(world, numbers))
-    options.say(f"{len(numbers)} episodes, {len(numbers) * each / 1e6:.0f} MB in {place}; "
+    options.echo(f"{len(numbers)} episodes, {len(numbers) * each / 1e6:.0f} MB in {place}; "
                 f"{missing} to simulate")
     free = shutil.disk_usage(place).free
     if missing * each > free:
         raise typer.BadParameter(f"seeds need {missing * each / 1e9:.1f} GB more, and "
                                  f"{free / 1e9:.1f} GB are free")
-    with options.clear_errors():
+    with options.cli_errors():
         made = presimulate(world, numbers, n_jobs=jobs, backend=backend)
-    options.say(f"{made} simulated, {len(numbers) - made} were there")
+    options.echo(f"{made} simulated, {len(numbers) - made} were there")
 
 
 def export(
@@ -78,19 +78,19 @@ def export(
     the end, and does not.
     """
     import eitbench
-    with options.clear_errors():
+    with options.cli_errors():
         if (policy is not None) != (format is Format.minari):
             raise ValueError("policy must be given with format minari, and with no other; got "
                              f"policy {policy} and format {format.value}")
         if policy is not None:
             from eitbench.bench.minari_export import export_minari
             written = export_minari(out, env, policy, seeds, n_jobs=jobs, backend=backend)
-            options.say(f"{written} episodes written; minari.load_dataset({out!r}) reads them")
+            options.echo(f"{written} episodes written; minari.load_dataset({out!r}) reads them")
         else:
             from eitbench.data.export import export as export_files
             examples = eitbench.dataset(env, seeds)
             written = export_files(examples, Path(out), format.value, n_jobs=jobs, backend=backend)
-            options.say(f"{written} episodes written to {out}, {len(examples) - written} were "
+            options.echo(f"{written} episodes written to {out}, {len(examples) - written} were "
                         "there")
 
 
@@ -113,14 +113,14 @@ def train(
     config.json, evaluations.npz (scores on dev episodes) and logs for TensorBoard.
     """
     from dataclasses import replace
-    with options.clear_errors():
+    with options.cli_errors():
         from eitbench.rl import training
         asked = training.read_config(config)
         if steps is not None:
             asked = replace(asked, total_steps=steps)
         folder = out or Path("results/training") / env.replace("/", "-") / algo / f"seed{seed}"
         model = training.train(env, algo.value, asked, seed, folder)
-    options.say(f"wrote {model}")
+    options.echo(f"wrote {model}")
 
 
 @fit.command("prior")
@@ -145,17 +145,17 @@ def fit_prior(
     from eitbench.estimation import fit_prior_from_episodes
     from eitbench.worlds.registry import entry
     regimes = {} if quiet is None else {"quiet": quiet}
-    with options.clear_errors():
+    with options.cli_errors():
         prior = fit_prior_from_episodes(
             entry(env).world, parse_seeds(seeds), link=link.value, nugget=nugget,
             variance_cutoff=kept, quiet_threshold=quiet,
             source={"environment": env, "seeds": seeds, "nugget": nugget, "kept": kept,
                     **regimes})
         prior.save(out)
-    options.say(f"{out}: {prior.modes.shape[1]} modes across {len(prior.points)} nodes of the "
+    options.echo(f"{out}: {prior.modes.shape[1]} modes across {len(prior.points)} nodes of the "
                 f"inlet, correlated over {prior.correlation_steps} steps of {prior.time_step:g} s")
     if prior.regimes is not None:
-        options.say(f"slugs enter {prior.regimes.share:.0%} of the time and last "
+        options.echo(f"slugs enter {prior.regimes.share:.0%} of the time and last "
                     f"{1.0 / prior.regimes.p_end:.1f} steps on average")
 
 
@@ -180,7 +180,7 @@ def fit_model(
 
     import eitbench
     from eitbench.estimation import identify_model
-    with options.clear_errors():
+    with options.cli_errors():
         examples = eitbench.dataset(env, seeds)
         model = identify_model(
             examples, modes=modes, residual_only=correct, linearised=linearised,
@@ -190,6 +190,6 @@ def fit_model(
                if said})
         model.save(out)
     left = float(model.residual_covariance.trace() / examples.mass.sum())
-    options.say(f"{out}: {modes} modes of the concentration, which remembers "
+    options.echo(f"{out}: {modes} modes of the concentration, which remembers "
                 f"{model.impulse_response.shape[1]} inflows; {100 * left**0.5:.2g} % "
                 "(root mean square) is left")

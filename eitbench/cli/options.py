@@ -11,9 +11,9 @@ from typing import Annotated
 
 import typer
 
-from eitbench._extras import explained
-from eitbench._files import readable
-from eitbench._foreign import cleaned
+from eitbench._extras import missing_extra
+from eitbench._files import resolve_input
+from eitbench._sanitize import sanitize
 from eitbench.data.parallel import WorkerLostError
 
 CORES = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
@@ -21,9 +21,9 @@ Backend = StrEnum("Backend", ["loky", "ray", "dask"])
 Isolation = StrEnum("Isolation", ["auto", "none", "process", "bubblewrap"])
 
 
-def found(path: Path | None) -> Path | None:
-    """The file or folder of an option, as `readable` finds it."""
-    return path and readable(path)
+def resolve_path(path: Path | None) -> Path | None:
+    """The file or folder of an option, as `resolve_input` finds it."""
+    return path and resolve_input(path)
 
 
 Out = Annotated[Path, typer.Option("--out", "-o", help="Folder of the results.")]
@@ -41,13 +41,13 @@ Environments = Annotated[list[str] | None, typer.Option(help="Environment id; ma
 InjectionId = Annotated[str, typer.Option(help="Id of an injection environment.")]
 Records = Annotated[Path, typer.Option(
     help="Folder of the records. Where there is none, those that come with the package.",
-    callback=found)]
+    callback=resolve_path)]
 RECORDS = Path("leaderboards/results")
 METHODS = Path("leaderboards/methods")
 """Where pull requests put the files of methods."""
 
 
-def numbers(seeds: str | None) -> list[int] | None:
+def parse_episodes(seeds: str | None) -> list[int] | None:
     """The episodes that are asked for, None if nothing is; ``ValueError`` without a split."""
     from eitbench.data.seeds import parse_seeds
     if seeds is None:
@@ -58,13 +58,13 @@ def numbers(seeds: str | None) -> list[int] | None:
     return parse_seeds(seeds)
 
 
-def say(text: object, *, err: bool = False) -> None:
+def echo(text: object, *, err: bool = False) -> None:
     """Print what may hold a stranger's words: nothing in them moves the cursor."""
-    typer.echo(cleaned(str(text), lines=True), err=err)
+    typer.echo(sanitize(str(text), lines=True), err=err)
 
 
 @contextmanager
-def clear_errors() -> Iterator[None]:
+def cli_errors() -> Iterator[None]:
     """Turn a ValueError about an argument, the loss of a process, an error in a worker, or a
     missing extra into a message instead of a traceback."""
     try:
@@ -73,21 +73,21 @@ def clear_errors() -> Iterator[None]:
         from eitbench.bench.isolation import WorkerError
         if not isinstance(error, WorkerLostError | WorkerError):
             raise
-        say(error, err=True)  # a traceback would show a stranger's words as they are
+        echo(error, err=True)  # a traceback would show a stranger's words as they are
         raise typer.Exit(1) from error
     except ModuleNotFoundError as error:
-        if (sentence := explained("this command", error)) is None:
+        if (sentence := missing_extra("this command", error)) is None:
             raise
-        say(sentence, err=True)
+        echo(sentence, err=True)
         raise typer.Exit(1) from error
     except ValueError as error:
-        raise typer.BadParameter(cleaned(str(error), lines=True)) from error
+        raise typer.BadParameter(sanitize(str(error), lines=True)) from error
 
 
-def say_differences(sentences: Iterable[str]) -> None:
+def report_differences(sentences: Iterable[str]) -> None:
     """What differs, one a line; then, if anything does, exit status 1."""
     wrong = list(sentences)
     for sentence in wrong:
-        say(f"differs: {cleaned(sentence)}", err=True)
+        echo(f"differs: {sanitize(sentence)}", err=True)
     if wrong:
         raise typer.Exit(1)

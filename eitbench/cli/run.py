@@ -47,7 +47,7 @@ def run(
     backend: options.Backends = options.Backend.loky,
     out: options.Out = Path("results"),
     records: Annotated[Path | None, typer.Option(
-        callback=options.found,
+        callback=options.resolve_path,
         help="For policies: folder of records whose episodes are not run again, such as "
              "leaderboards/results.")] = None,
 ) -> None:
@@ -62,19 +62,19 @@ def run(
     from eitbench.bench.run import pending_jobs, run_jobs
     from eitbench.bench.store import EpisodeStore, folder_results
     from eitbench.bench.variants import variants
-    with options.clear_errors():
+    with options.cli_errors():
         track = _track_of(env or [], baseline, policy)
         if records is not None and not records.is_dir():
             raise ValueError(f"--records must be a folder, got {records}")
         worlds = variants(settings or [])
         todo = suites.make_jobs(track, env or [], (baseline or policy or []),
-                                options.numbers(seeds), suite=suite, estimator=estimator,
+                                options.parse_episodes(seeds), suite=suite, estimator=estimator,
                                 isolate=isolate, worlds=worlds)
         before = folder_results(records) if records else []
         store = EpisodeStore(out)
         left = pending_jobs(todo, before) if before else todo
-        run_jobs(left, store, n_jobs=jobs, backend=backend, command=typed())
-        report(out, todo, worlds, before)
+        run_jobs(left, store, n_jobs=jobs, backend=backend, command=command_line())
+        print_report(out, todo, worlds, before)
         _end_if_lost(todo, store, before)
 
 
@@ -94,7 +94,7 @@ def _track_of(env: list[str], baseline: list[str] | None, policy: list[str] | No
     return tracks.pop() if tracks else "estimation"
 
 
-def report(out: Path, asked: Sequence[Job] = (), worlds: Sequence[dict[str, Any]] = ({},),
+def print_report(out: Path, asked: Sequence[Job] = (), worlds: Sequence[dict[str, Any]] = ({},),
            before: Sequence[dict[str, Any]] = ()) -> None:
     """Print the table of what was ``asked`` for (default: of all that the folder holds) and write
     Markdown and page of all; of several ``worlds`` that differ in a number, how errors follow it.
@@ -118,18 +118,18 @@ def report(out: Path, asked: Sequence[Job] = (), worlds: Sequence[dict[str, Any]
     number = swept_parameter(worlds)
     found = sweeps(told, number) if number else []
     width = shutil.get_terminal_size().columns
-    options.say("\n\n".join(each.text(width) for each in found) if found
+    options.echo("\n\n".join(each.text(width) for each in found) if found
                 else terminal_tables(run_leaderboards(told, known), width))
     for name in dict.fromkeys(job.environment.name for job in asked):
         jobs = [job for job in asked if job.environment.name == name]
         if gap := gap_text(policy_rows(jobs, [*before, *store.results()])):
-            options.say(f"\n{name}: {gap}")
+            options.echo(f"\n{name}: {gap}")
     _say_failures(store, told, asked)
     write_page(store, boards, found)
-    options.say(f"\nwrote {out / 'index.html'}")
+    options.echo(f"\nwrote {out / 'index.html'}")
 
 
-def typed() -> str:
+def command_line() -> str:
     """The command."""
     return shlex.join(["eitbench", *sys.argv[1:]])
 
@@ -140,10 +140,10 @@ def _say_failures(store: EpisodeStore, records: list[dict[str, Any]],
     from eitbench.report.failures import debug_command, failures
     found = failures(store, records)
     for failure in found:
-        options.say(failure, err=True)
+        options.echo(failure, err=True)
     hints = filter(None, (debug_command(failure, asked) for failure in found))
-    if (hint := next(hints, "")) and "--isolate none" not in typed().replace("=", " "):
-        options.say(f"to debug it in this process, where breakpoint() stops:\n  {hint}", err=True)
+    if (hint := next(hints, "")) and "--isolate none" not in command_line().replace("=", " "):
+        options.echo(f"to debug it in this process, where breakpoint() stops:\n  {hint}", err=True)
 
 
 def _end_if_lost(asked: Sequence[Job], store: EpisodeStore,
@@ -153,5 +153,5 @@ def _end_if_lost(asked: Sequence[Job], store: EpisodeStore,
     done = {job.method for job in successful_results(asked, [*before, *store.results()])}
     lost = dict.fromkeys(job.load().name for job in asked if job.method not in done)
     if lost:
-        options.say(f"no episode was finished by {', '.join(lost)}", err=True)
+        options.echo(f"no episode was finished by {', '.join(lost)}", err=True)
         raise typer.Exit(1)

@@ -13,7 +13,7 @@ from eitbench.cli import options
 
 def verify(
     paths: Annotated[list[Path] | None, typer.Argument(
-        help="Files of records.", callback=lambda paths: [options.found(path)
+        help="Files of records.", callback=lambda paths: [options.resolve_path(path)
                                                           for path in paths or []])] = None,
     method: Annotated[str | None, typer.Option(
         "--method", "--baseline", "--policy",
@@ -54,7 +54,7 @@ def verify(
 
     from eitbench.bench.held_out import read_secret
     from eitbench.bench.verify import select_records
-    with options.clear_errors():
+    with options.cli_errors():
         _check_arguments(paths or [], every, top, episodes, held_out, secret, method)
         key = read_secret(secret) if secret else b""
         chosen = paths or select_records(records, env or [], top=top)
@@ -69,8 +69,8 @@ def verify(
                                 "n_jobs": jobs, "backend": backend})
         if held_out:
             problems += _held_out(chosen, Path(temporary), method, isolate, key, held_out)
-    options.say_differences(problems)
-    options.say(f"{len(chosen)} of {len(chosen)} records agree with their reruns")
+    options.report_differences(problems)
+    options.echo(f"{len(chosen)} of {len(chosen)} records agree with their reruns")
 
 
 def _check_arguments(paths: list[Path], every: bool, top: int, episodes: int, held_out: int,
@@ -89,12 +89,12 @@ def _rerun(paths: list[Path], folder: Path, tolerance: float, episodes: int, see
            how: dict[str, Any]) -> list[str]:
     """Print the table of reruns and return the problems."""
     from eitbench.bench import verify as verification
-    with options.clear_errors():
+    with options.cli_errors():
         rows = verification.verify(paths, folder, episodes=episodes, seed=seed, **how)
     table = verification.verification_table(rows, tolerance)
-    options.say(f"episodes drawn with --seed {seed}\n\n{table}\n")
+    options.echo(f"episodes drawn with --seed {seed}\n\n{table}\n")
     for note in dict.fromkeys(filter(None, rows["note"])):
-        options.say(f"{note}\n")
+        options.echo(f"{note}\n")
     return verification.describe_problems(rows, tolerance)
 
 
@@ -124,7 +124,7 @@ def _held_out(paths: list[Path], folder: Path, method: str | None, isolate: str,
         close()
     digest = hashlib.sha256(secret).hexdigest()
     table = Table.of(rows).markdown() if rows else ""
-    options.say(f"held-out episodes of the secret with sha256 {digest}\n\n{table}\n")
+    options.echo(f"held-out episodes of the secret with sha256 {digest}\n\n{table}\n")
     return problems
 
 

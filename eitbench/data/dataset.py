@@ -20,7 +20,7 @@ from scipy.sparse.linalg import splu
 from tqdm import tqdm
 
 from eitbench import _check
-from eitbench._extras import needed_by
+from eitbench._extras import require_extra
 from eitbench.data.episode_cache import (
     cached_episode,
     cycle_voltages,
@@ -183,7 +183,7 @@ class Dataset:
 
         Missing episodes are simulated one by one; `eitbench bank` is faster.
         """
-        with needed_by("a dataset for torch"):
+        with require_extra("a dataset for torch"):
             import torch  # noqa: F401
         return TorchDataset(self)
 

@@ -14,7 +14,7 @@ import numpy as np
 from tqdm import tqdm
 
 from eitbench import _check
-from eitbench._notice import Wait
+from eitbench._notice import SlowTaskNotice
 from eitbench.data.cache import Key, cached, episode_key
 from eitbench.worlds.instrument import Faults
 from eitbench.worlds.random_streams import episode_streams
@@ -105,7 +105,7 @@ def simulate_batch(world: World, seeds: Sequence[int], progress: bool = True,
     electrodes = truth.observation.cem.n_electrodes
     steps = world.n_steps if last is None else last
     total = (world.spin_up_steps + 2 * steps) * len(seeds)
-    wait = Wait(label, total, PRESIMULATE_HINT)
+    wait = SlowTaskNotice(label, total, PRESIMULATE_HINT)
     with tqdm(total=total, desc=label, unit="step", leave=False,
               disable=None if progress else True) as bar:
         def tick(steps: int) -> None:

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
-from eitbench._extras import needed_by
+from eitbench._extras import require_extra
 from eitbench._files import PACKAGE, write_atomically
 from eitbench.data.cache import config_dict, world_digest
 from eitbench.data.dataset import Dataset
@@ -49,7 +49,7 @@ def export(examples: Dataset, folder: Path, format: str = "npz", *, n_jobs: int 
         raise ValueError(f"format must be one of {', '.join(SUFFIXES)}, got {format!r}")
     if examples.basis is not None:
         raise ValueError("examples must have their truth on the nodes, got reduced coordinates")
-    with needed_by(f"format {format}"):
+    with require_extra(f"format {format}"):
         if format == "hdf5":
             import h5py  # noqa: F401
     encode = _hdf5 if format == "hdf5" else _npz

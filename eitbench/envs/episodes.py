@@ -19,7 +19,7 @@ from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
 from eitbench import _check
-from eitbench._extras import needed_by
+from eitbench._extras import require_extra
 from eitbench.data.episode_cache import cached_episode, cached_episode_prefix, concentration_at
 from eitbench.data.presimulation import EpisodeSampler
 from eitbench.data.seeds import warn_test_seeds
@@ -202,7 +202,7 @@ class EpisodeEnv(FixedLengthEnv):
         if not self.can_render():
             return None
         self.require_reset("render()")
-        with needed_by("render()"):
+        with require_extra("render()"):
             from eitbench.envs.rendering import draw_frame
         t, estimate, spread, currents = self._picture()
         truth = concentration_at(self.world, self.core.seeds[0], t, self.core.n_initial + 1)

@@ -12,7 +12,7 @@ import numpy as np
 from gymnasium import spaces
 
 from eitbench import _check
-from eitbench._extras import needed_by
+from eitbench._extras import require_extra
 from eitbench.envs.episodes import RENDER_MODES, RESET_NEEDED, FixedLengthEnv, Observation
 from eitbench.envs.estimation import check_actions
 from eitbench.measured import Measurements, quality, read
@@ -197,7 +197,7 @@ class MeasuredEnv(FixedLengthEnv):
             return None
         if self._step == 0:
             raise gym.error.ResetNeeded("call reset() before render()")
-        with needed_by("render()"):
+        with require_extra("render()"):
             from eitbench.envs.rendering import draw_comparison
         t = max(self._step - 2, 0)
         estimate = self._last

@@ -14,7 +14,7 @@ import numpy as np
 
 from eitbench import _check
 from eitbench._files import write_atomically
-from eitbench._notice import say
+from eitbench._notice import notify
 from eitbench.data.seeds import SPLITS, format_seed
 from eitbench.worlds.registry import entries
 
@@ -249,7 +249,7 @@ def compatible_priors(folder: Path, task: Task, link: str) -> list[InflowPrior]:
 @lru_cache
 def _say_other_world(world: str, learned: str) -> None:
     """Report once a process which prior stands in for a missing one."""
-    say(f"no inflow prior was learned in {world!r}: that of {learned} is used; "
+    notify(f"no inflow prior was learned in {world!r}: that of {learned} is used; "
         "make one by `eitbench fit prior`")
 
 

@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 
 from eitbench import _check
-from eitbench._extras import needed_by
-from eitbench._files import replacing
+from eitbench._extras import require_extra
+from eitbench._files import atomic_path
 
 FILE_FORMAT, FORMAT_VERSION = "eitbench measurements", 1
 DATASETS = {"currents": "currents", "injection_index": "injections", "matrix": "matrix",
@@ -130,10 +130,10 @@ class Measurements:
 
     def save(self, path: Path | str) -> Path:
         """Write one HDF5 file atomically; requires the extra ``export``."""
-        with needed_by("a file of measurements"):
+        with require_extra("a file of measurements"):
             import h5py
         path = Path(path)
-        with replacing(path) as temporary, h5py.File(temporary, "w") as file:
+        with atomic_path(path) as temporary, h5py.File(temporary, "w") as file:
             file.attrs.update(format=FILE_FORMAT, version=FORMAT_VERSION,
                               source=json.dumps(dict(self.source)))
             for name, dataset in (DATASETS | {"reference": "reference"}).items():
@@ -148,7 +148,7 @@ class Measurements:
         Data sets of more than `MAX_IN_MEMORY_BYTES` are memory-mapped; their file must not
         change. ``ValueError`` names the file and the error.
         """
-        with needed_by("a file of measurements"):
+        with require_extra("a file of measurements"):
             import h5py
         path = Path(path)
         try:

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from eitbench import _check
-from eitbench._extras import needed_by
+from eitbench._extras import require_extra
 from eitbench.measured.matlab import load_variables, provenance, read_eidors, read_ktc
 from eitbench.measured.measurements import Measurements
 
@@ -302,7 +302,7 @@ def _table_options(table: Path) -> dict[str, Any]:
 
 def load_yaml(path: Path, subject: str) -> dict[str, Any]:
     """Load the entries of a YAML file that describes ``subject``; ``ValueError`` names the file."""
-    with needed_by(f"the YAML file of a {subject}"):
+    with require_extra(f"the YAML file of a {subject}"):
         import yaml
     try:
         content = yaml.safe_load(path.read_text(encoding="utf-8"))

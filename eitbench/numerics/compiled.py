@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from eitbench._notice import say
+from eitbench._notice import notify
 
 
 def compiled_kernels() -> Any:
@@ -32,7 +32,7 @@ def _announce_compilation(folder: Path) -> None:
     """Print a message before the first compilation, whose result numba stores in ``folder``."""
     is_elsewhere = "NUMBA_CACHE_DIR" in os.environ or not os.access(folder.parent, os.W_OK)
     if not is_elsewhere and not any(folder.glob("kernels.*.nbi")):
-        say("compiling the kernels, some 20 s, once after installation; "
+        notify("compiling the kernels, some 20 s, once after installation; "
             "`eitbench bank --seeds train:0` does so in advance")
 
 

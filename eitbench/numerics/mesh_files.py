@@ -21,7 +21,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from eitbench import _check
-from eitbench._extras import explained
+from eitbench._extras import missing_extra
 from eitbench.numerics.mesh import Mesh, facet_set
 
 _CELL = {2: "triangle", 3: "tetra"}
@@ -104,7 +104,7 @@ def _content(path: Path) -> Any:
     try:
         import meshio
     except ModuleNotFoundError as error:
-        raise ValueError(explained("reading mesh files", error) or error) from None
+        raise ValueError(missing_extra("reading mesh files", error) or error) from None
     printed = StringIO()
     try:
         with redirect_stdout(printed), redirect_stderr(printed):

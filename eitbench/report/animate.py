@@ -16,7 +16,7 @@ from eitbench import _check
 from eitbench.bench.isolation import choose_isolation
 from eitbench.bench.methods import Method
 from eitbench.bench.run import Job
-from eitbench.bench.tracks import Environment, board_of
+from eitbench.bench.tracks import Environment, subtrack_of
 from eitbench.envs.rendering import (
     FIELD_COLORMAP,
     IDLE,
@@ -53,9 +53,9 @@ def animate(environment: str, methods: Sequence[str], seed: str, step: int | Non
                   for method, kind in zip(methods, kinds, strict=True)]
         env: Any = asked.make(render_mode="rgb_array")
         for each in loaded:
-            if board_of(env) not in each.boards:
-                raise ValueError(f"baseline {each.name} plays {', '.join(each.boards)}, but "
-                                 f"{environment} is a {board_of(env)} environment")
+            if subtrack_of(env) not in each.subtracks:
+                raise ValueError(f"baseline {each.name} plays {', '.join(each.subtracks)}, but "
+                                 f"{environment} is a {subtrack_of(env)} environment")
         begin = env.core.n_initial + 1 if asked.track == "injection" else 1
         first, last = env.world.warm_up + 1, env.world.n_steps
         if step is not None:

@@ -16,8 +16,8 @@ from urllib.parse import quote
 import numpy as np
 import pandas as pd
 
-from eitbench._files import shipped
-from eitbench.bench.episode_table import read_episode_table, table_beside
+from eitbench._files import bundled_path
+from eitbench.bench.episode_table import read_episode_table, table_path
 from eitbench.bench.ranking import shared_ranks
 from eitbench.bench.records import (
     BOARDS,
@@ -34,10 +34,17 @@ from eitbench.bench.statistics import (
     stratified_bootstrap,
 )
 from eitbench.bench.text import scores_by_seed, seed_ranges
-from eitbench.bench.tracks import CLASSES, FLOORS, home_of, ids, named, track_of_board
-from eitbench.bench.tracks import class_of as class_of_board
-from eitbench.bench.variants import as_typed, flat
-from eitbench.scoring import skill
+from eitbench.bench.tracks import (
+    CATEGORIES,
+    NAIVE_BASELINES,
+    environment_name,
+    ids,
+    nominal_id,
+    track_of_subtrack,
+)
+from eitbench.bench.tracks import category_of as class_of_board
+from eitbench.bench.variants import flatten, format_setting
+from eitbench.scoring import normalised_score
 
 ALL = "all"
 """Name of the environment in the rows of an aggregate."""
@@ -197,7 +204,7 @@ def boards(records: list[dict[str, Any]]) -> pd.DataFrame:
 
 
 def record_category(record: dict[str, Any]) -> str:
-    """Return the class in `CLASSES` of a record."""
+    """Return the class in `CATEGORIES` of a record."""
     return class_of_board(record["environment"]["id"], record["board"])
 
 
@@ -219,15 +226,16 @@ def world_key(record: dict[str, Any]) -> str:
 def environment_title(record: dict[str, Any]) -> str:
     """Return the environment's id without its prefix, and its arguments."""
     environment = record["environment"]
-    given = {} if environment["name"] == named(environment["id"], {}) else environment["kwargs"]
+    is_default = environment["name"] == environment_name(environment["id"], {})
+    given = {} if is_default else environment["kwargs"]
     return environment["id"].removeprefix("eitbench/") + _arguments(given)
 
 
 def _arguments(kwargs: dict[str, Any]) -> str:
     """`` (flow.mean_velocity=45.0, lag=3)``, or nothing."""
     given = {key: value for key, value in kwargs.items() if value is not None}
-    flattened = flat(given | given.pop("world", {}))
-    texts = [f"{key}={as_typed(value)}" for key, value in sorted(flattened.items())]
+    flattened = flatten(given | given.pop("world", {}))
+    texts = [f"{key}={format_setting(value)}" for key, value in sorted(flattened.items())]
     return f" ({', '.join(texts)})" if texts else ""
 
 
@@ -255,7 +263,7 @@ def leaderboards(records: list[dict[str, Any]]) -> list[Leaderboard]:
     current, _ = split_outdated(records)
     known = anchors(current)
     found: list[Leaderboard] = []
-    for name in CLASSES:
+    for name in CATEGORIES:
         members = [record for record in current if record_category(record) == name]
         made = _boards(members, current, known, ranked=True)
         found += [*made, *_aggregate(name, _aggregate_boards(made))]
@@ -359,7 +367,7 @@ def naive_baseline_record(records: Iterable[dict[str, Any]]) -> dict[str, Any] |
 
 def is_naive_baseline(record: dict[str, Any]) -> bool:
     """Return whether it is a record of the built-in floor: third-party versions are no numbers."""
-    return (record["method"] == FLOORS[track_of_board(record["board"])]
+    return (record["method"] == NAIVE_BASELINES[track_of_subtrack(record["board"])]
             and version_number(record["version"]) is not None)
 
 
@@ -397,7 +405,7 @@ def _with_interval(name: str, values: dict[str, dict[str, float]],
 def aggregate_environments() -> set[str]:
     """Return the names of the environments of aggregates: all registered ids with their default
     arguments, without shifts, which have a board of their own."""
-    return {named(id, {}) for id in ids() if not home_of(id)}
+    return {environment_name(id, {}) for id in ids() if not nominal_id(id)}
 
 
 def _aggregate_boards(made: list[Leaderboard]) -> list[Leaderboard]:
@@ -482,7 +490,7 @@ def bundled_anchors(records: Iterable[dict[str, Any]]) -> Anchors:
     """Return the `anchors` of the worlds of these records among the records of the package."""
     kinds = {base_environment(record["environment"]["id"]) for record in records}
     known = [id.replace("/", "-") for id in ids("estimation") if base_environment(id) in kinds]
-    published = read_episode_table(table_beside(shipped("leaderboards") / "results"))
+    published = read_episode_table(table_path(bundled_path("leaderboards") / "results"))
     return anchors(record for record in published if record["method"] in SKILL_ANCHORS
                    and record["environment"]["name"] in known)
 
@@ -499,7 +507,7 @@ def _normalised_score(record: dict[str, Any], known: Anchors) -> float | None:
         return None
     e, high, low = (float(np.mean([each[seed] for seed in shared]))
                     for each in (own, floor, reference))
-    return skill(e, high, low) if high != low else None
+    return normalised_score(e, high, low) if high != low else None
 
 
 def _matmul_seconds(records: Iterable[dict[str, Any]]) -> dict[str, float]:

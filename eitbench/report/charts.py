@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from markupsafe import Markup
 
-from eitbench._foreign import cleaned
+from eitbench._sanitize import sanitize
 
 WIDTH, HEIGHT, LEFT, RIGHT, TOP, BOTTOM = 860, 360, 76, 30, 12, 46
 N_COLOURS = 12
@@ -189,7 +189,7 @@ def _vertical_line(px: Axis, mark: float | None, height: float = 14) -> str:
 def _frame(px: Axis, py: Axis, x_label: str, y_label: str) -> list[str]:
     """Begin a drawing with grid, ticks and labels."""
     bottom = HEIGHT - BOTTOM
-    label = escape(cleaned(f"{y_label} over {x_label}"))
+    label = escape(sanitize(f"{y_label} over {x_label}"))
     parts = [f'<svg viewBox="0 0 {WIDTH} {HEIGHT}" role="img" aria-label="{label}">']
     for tick in py.ticks():
         parts += [_polyline("grid", [(LEFT, py(tick)), (WIDTH - RIGHT, py(tick))]),
@@ -205,11 +205,11 @@ def _frame(px: Axis, py: Axis, x_label: str, y_label: str) -> list[str]:
 def _text(x: float, y: float, anchor: str, words: str, kind: str = "") -> str:
     of_kind = f' class="{kind}"' if kind else ""
     return (f'<text{of_kind} x="{x:.1f}" y="{y:.1f}" text-anchor="{anchor}">'
-            f'{escape(cleaned(words))}</text>')
+            f'{escape(sanitize(words))}</text>')
 
 
 def _svg_title(words: str) -> str:
-    return f"<title>{escape(cleaned(words))}</title>"
+    return f"<title>{escape(sanitize(words))}</title>"
 
 
 def _polyline(kind: str, places: Sequence[tuple[float, float]], colour: int | None = None,

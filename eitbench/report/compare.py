@@ -10,7 +10,7 @@ from typing import Any
 import pandas as pd
 
 from eitbench import _check
-from eitbench._files import readable, shipped
+from eitbench._files import bundled_path, resolve_input
 from eitbench.bench.records import (
     finished_at,
     read_record,
@@ -26,9 +26,9 @@ from eitbench.bench.statistics import (
     paired_difference,
     paired_probability_of_improvement,
 )
-from eitbench.bench.table import NOTHING, Cell, Table, number_cell
-from eitbench.bench.text import scores_by_seed, with_interval
-from eitbench.bench.tracks import CLASSES
+from eitbench.bench.table import MISSING, Cell, Table, number_cell
+from eitbench.bench.text import format_interval, scores_by_seed
+from eitbench.bench.tracks import CATEGORIES
 from eitbench.report.boards import is_naive_baseline, record_category, skill_scores
 
 COMPARISON_FIELDS = ("environment", "score", "episodes", "a", "b", "difference", "low", "high",
@@ -36,7 +36,7 @@ COMPARISON_FIELDS = ("environment", "score", "episodes", "a", "b", "difference",
 SKILL_SCORE = "gain"
 """Score over several environments instead of the error, whose mean the largest would dominate: 1 −
 ẽ_c over that of the floor in the same episode, as on the boards."""
-BUNDLED_RECORDS = shipped("leaderboards") / "results"
+BUNDLED_RECORDS = bundled_path("leaderboards") / "results"
 """Records of the package."""
 MIN_VERSION_PREFIX = 4
 """Least number of first digits of a sha256 that name a version."""
@@ -53,7 +53,7 @@ def find_records(name: str, folder: Path) -> list[dict[str, Any]]:
         If there is none, or a name without version fits several versions.
     """
     if name.endswith(".json"):
-        return [read_record(readable(Path(name)))]
+        return [read_record(resolve_input(Path(name)))]
     method, _, version = name.partition("@")
 
     def fits(own: str) -> bool:
@@ -74,15 +74,16 @@ def find_records(name: str, folder: Path) -> list[dict[str, Any]]:
             raise ValueError(f"{name} fits several versions: {found}")
         if own:
             return own
-    raise ValueError(f"there is no record of {name} in {folder}" + _check.nearest(method, known))
+    raise ValueError(f"there is no record of {name} in {folder}"
+                     + _check.did_you_mean(method, known))
 
 
 def resolve_score(name: str) -> Score:
     """Return the score of this name; ``ValueError`` if none has a better direction."""
-    known = {each.name: each for each in scores().values() if each.better in ("lower", "higher")}
+    known = {each.name: each for each in scores().values() if each.direction in ("lower", "higher")}
     if name not in known:
         raise ValueError(f"score must be one of {', '.join(known)}; got {name!r}"
-                         + _check.nearest(name, known))
+                         + _check.did_you_mean(name, known))
     return known[name]
 
 
@@ -115,10 +116,10 @@ def compare(a: list[dict[str, Any]], b: list[dict[str, Any]], score: str = "erro
     ValueError
         If there is no such score, or no environment in which both have it in an episode.
     """
-    higher = resolve_score(score).better == "higher"
+    higher = resolve_score(score).direction == "higher"
     theirs = {_environment_and_split(record): scores_by_seed(record, score) for record in b}
     both: dict[str, tuple[dict[str, float], dict[str, float]]] = {}
-    gains: dict[str, dict[str, Any]] = {kind: {} for kind in CLASSES}
+    gains: dict[str, dict[str, Any]] = {kind: {} for kind in CATEGORIES}
     levels = {_environment_and_split(record): scores_by_seed(record, "error") for record in
               sorted(zero, key=lambda record: (record["official"], finished_at(record)))}
     for record in sorted(a, key=_environment_and_split):
@@ -174,8 +175,8 @@ def comparison_table(table: pd.DataFrame, a: str, b: str, score: str = "error") 
     rows = []
     for row in table.to_dict("records"):
         is_gain = row["score"] == SKILL_SCORE
-        less, more = (b, a) if is_gain or asked.better == "higher" else (a, b)
-        three = with_interval(row["difference"], row["low"], row["high"])
+        less, more = (b, a) if is_gain or asked.direction == "higher" else (a, b)
+        three = format_interval(row["difference"], row["low"], row["high"])
         share = f"{100 * row['better']:.0f} %"
         if math.isfinite(row["low"]):
             share += f" ({100 * row['better_low']:.0f} to {100 * row['better_high']:.0f} %)"
@@ -186,7 +187,7 @@ def comparison_table(table: pd.DataFrame, a: str, b: str, score: str = "error") 
                       for key, cell in levels.items()}
         rows.append({
             "environment": row["environment"].removeprefix("eitbench-"),
-            "verdict": less if row["high"] < 0 else more if row["low"] > 0 else NOTHING,
+            "verdict": less if row["high"] < 0 else more if row["low"] > 0 else MISSING,
             "episodes": Cell(str(row["episodes"]), float(row["episodes"])), **levels,
             "difference": Cell(three, row["difference"]),
             f"{a} better": Cell(share, row["better"])})
@@ -197,6 +198,6 @@ def format_comparison(table: pd.DataFrame, a: str, b: str, score: str, width: in
     """Return the comparison in lines of ``width`` characters, where the methods are A and B."""
     whole = comparison_table(table, "A", "B", score)
     first = ("environment", "verdict", "difference", *whole.headings[3:5], "A better", "episodes")
-    fitted = whole.fitted(width, first)
+    fitted = whole.fit_width(width, first)
     return "\n\n".join([f"A: {a}\nB: {b}", fitted.markdown(),
-                        *filter(None, [whole.left_out(fitted)])])
+                        *filter(None, [whole.omitted_columns(fitted)])])

@@ -8,11 +8,11 @@ import textwrap
 from collections.abc import Iterable
 from typing import Any, NamedTuple
 
-from eitbench._foreign import cleaned
+from eitbench._sanitize import sanitize
 from eitbench.bench.run import Job
 from eitbench.bench.store import EpisodeStore
 from eitbench.bench.text import seed_ranges
-from eitbench.bench.variants import as_typed, flat
+from eitbench.bench.variants import flatten, format_setting
 from eitbench.data.seeds import format_seed
 
 _METHOD_OPTIONS = {"estimation": "--baseline", "injection": "--policy"}
@@ -31,7 +31,7 @@ class Failure(NamedTuple):
     def __str__(self) -> str:
         environment = self.record["environment"]["id"]
         where = f"{self.record['method']} in {environment} on {seed_ranges(self.seeds)}"
-        return f"failed: {where}: {cleaned(self.message)}" + (
+        return f"failed: {where}: {sanitize(self.message)}" + (
             "\n" + textwrap.indent(self.traceback.rstrip(), "  ") if self.traceback else "")
 
 
@@ -71,8 +71,8 @@ def debug_command(failure: Failure, jobs: Iterable[Job]) -> str:
     for job in jobs:
         if _key(job) == failed:
             given = json.loads(job.environment.kwargs)
-            changes = [f"--set={number}={as_typed(value)}"
-                       for number, value in flat(given.get("world", {})).items()]
+            changes = [f"--set={number}={format_setting(value)}"
+                       for number, value in flatten(given.get("world", {})).items()]
             estimator = ["--estimator", given["estimator"]] if "estimator" in given else []
             return shlex.join(["eitbench", "run", "--env", job.environment.id,
                                _METHOD_OPTIONS[job.environment.track], job.method, "--seeds", first,

@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from eitbench._files import write_atomically
-from eitbench._foreign import cleaned
+from eitbench._sanitize import sanitize
 from eitbench.bench.records import group_runs
 from eitbench.bench.store import EpisodeStore
 from eitbench.bench.text import seed_ranges
@@ -83,7 +83,7 @@ def _snapshots(store: EpisodeStore, board: Leaderboard) -> dict[str, Any] | None
         env.reset(seed=parse_seeds(seed)[0])
     task = env.task
     if any(field.shape != (task.n_steps, task.mesh.n_nodes) for field in fields):
-        warnings.warn(f"no pictures of {seed}: estimates of {cleaned(environment['name'])} have "
+        warnings.warn(f"no pictures of {seed}: estimates of {sanitize(environment['name'])} have "
                       "another shape than its states", stacklevel=2)
         return None
     truth = env.truth()

@@ -13,7 +13,7 @@ from matplotlib.ticker import LogLocator, NullFormatter
 from tqdm import tqdm
 
 from eitbench import _check, scoring
-from eitbench.bench.evaluation import environment_of, method_given
+from eitbench.bench.evaluation import resolve_environment, resolve_method
 from eitbench.bench.runner import is_compatible, iter_estimates, iter_injections
 from eitbench.bench.scores import scores
 from eitbench.bench.text import mean_and_interval
@@ -88,8 +88,8 @@ def episode(method: Any, env: str | gym.Env, seed: int | str, *,
         If an argument is wrong, or the method does not suit the environment.
     """
     import matplotlib.pyplot as plt
-    asked = environment_of(env, world)
-    loaded = method_given(method, asked.track)
+    asked = resolve_environment(env, world)
+    loaded = resolve_method(method, asked.track)
     number = parse_single_seed(seed)
     made = asked.make()
     if not is_compatible(loaded, made):
@@ -145,7 +145,7 @@ def compare(table: pd.DataFrame | Iterable[pd.DataFrame], ax: Axes | None = None
     if score not in rows or score in ("environment", "method", "seed"):
         known = [name for name in rows if name in scores()]
         raise ValueError(f"score must be one of {', '.join(known)}; got {score!r}"
-                         + _check.nearest(score, known))
+                         + _check.did_you_mean(score, known))
     several = rows["environment"].nunique() > 1
     names = rows["method"] + (", " + rows["environment"] if several else "")
     values = {str(name): own.dropna().astype(float).to_numpy()
@@ -154,7 +154,7 @@ def compare(table: pd.DataFrame | Iterable[pd.DataFrame], ax: Axes | None = None
     if not values:
         raise ValueError(f"table must have a method with the score {score}, got none")
     asked = scores()[score]
-    sign = -1.0 if asked.better == "higher" else 1.0
+    sign = -1.0 if asked.direction == "higher" else 1.0
     order = sorted(values, key=lambda name: -sign * values[name].mean())
     if ax is None:
         import matplotlib.pyplot as plt

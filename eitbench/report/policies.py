@@ -11,7 +11,7 @@ import pandas as pd
 
 from eitbench.bench.run import Job, successful_results
 from eitbench.bench.scores import scores
-from eitbench.bench.statistics import FEWEST, stratified_bootstrap
+from eitbench.bench.statistics import MIN_EPISODES, stratified_bootstrap
 from eitbench.report.tables import agent_name
 
 OPEN_LOOP = ("adjacent", "opposite", "transverse", "best_pair", "best_cycle", "best_currents",
@@ -77,5 +77,5 @@ def gap_text(rows: pd.DataFrame) -> str:
     except ValueError:
         return ""
     interval = (f"95 % interval {low:.2f} to {high:.2f}" if math.isfinite(low)
-                else f"an interval takes {FEWEST} episodes")
+                else f"an interval takes {MIN_EPISODES} episodes")
     return f"adaptivity gap {gap:.2f} ({interval}) over {rows['seed'].nunique()} episodes"

@@ -9,7 +9,7 @@ import numpy as np
 
 from eitbench.bench.table import Table, mean_cell, number_cell
 from eitbench.bench.text import scores_by_seed
-from eitbench.bench.variants import as_typed, flat
+from eitbench.bench.variants import flatten, format_setting
 from eitbench.report import charts
 from eitbench.report.boards import base_environment
 
@@ -29,7 +29,7 @@ class Sweep(NamedTuple):
 
     def table(self, *, intervals: bool = True) -> Table:
         """Return a row for each method and a column for each value."""
-        names = [as_typed(value) for value in self.values]
+        names = [format_setting(value) for value in self.values]
         cells = {method: [mean_cell(errors) if intervals else number_cell(_mean(errors))
                           for errors in each] for method, each in self.errors.items()}
         return Table.of(({"method": charts.truncate(method, MAX_METHOD_CHARS),
@@ -41,7 +41,7 @@ class Sweep(NamedTuple):
         table = self.table()
         if len(table.markdown().partition("\n")[0]) > width:
             table = self.table(intervals=False)
-        fitted = table.fitted(width, table.headings)
+        fitted = table.fit_width(width, table.headings)
         hidden = len(table.headings) - len(fitted.headings)
         return "\n\n".join([f"{self.title}: ẽ_c for {self.parameter} =", fitted.markdown(),
                             *[f"no room for {hidden} values"] * bool(hidden)])
@@ -66,8 +66,9 @@ def _mean(errors: list[float]) -> float:
 
 def swept_parameter(worlds: Iterable[dict[str, Any]]) -> str | None:
     """Return the one number in which variants differ; None if they do not differ in exactly one."""
-    changes = [flat(world) for world in worlds]
-    differ = [key for key in changes[0] if len({as_typed(each.get(key)) for each in changes}) > 1]
+    changes = [flatten(world) for world in worlds]
+    differ = [key for key in changes[0]
+              if len({format_setting(each.get(key)) for each in changes}) > 1]
     return differ[0] if len(differ) == 1 else None
 
 
@@ -76,11 +77,11 @@ def sweeps(records: Iterable[dict[str, Any]], number: str) -> list[Sweep]:
     boards: dict[str, dict[str, dict[str, list[float]]]] = {}
     values: dict[str, Any] = {}
     for record in records:
-        value = flat(record["environment"]["kwargs"].get("world", {})).get(number)
-        values[as_typed(value)] = value
+        value = flatten(record["environment"]["kwargs"].get("world", {})).get(number)
+        values[format_setting(value)] = value
         title = f"{base_environment(record['environment']['id'])}, {record['board']}"
         own = boards.setdefault(title, {}).setdefault(record["method"], {})
-        own[as_typed(value)] = list(scores_by_seed(record, "error").values())
+        own[format_setting(value)] = list(scores_by_seed(record, "error").values())
 
     def order(name: str) -> tuple[bool, Any]:
         is_number = isinstance(values[name], int | float)

@@ -14,10 +14,10 @@ import numpy as np
 import pandas as pd
 from markupsafe import Markup
 
-from eitbench._foreign import as_markdown
-from eitbench.bench.table import NOTHING, Cell, Table, mean_cell, number_cell
+from eitbench._sanitize import escape_markdown
+from eitbench.bench.table import MISSING, Cell, Table, mean_cell, number_cell
 from eitbench.bench.table import Row as TableRow
-from eitbench.bench.text import number, scores_by_seed, with_interval
+from eitbench.bench.text import format_interval, format_number, scores_by_seed
 from eitbench.report import charts
 from eitbench.report.boards import (
     COST_COLUMNS,
@@ -126,15 +126,15 @@ class ScoreAxes(NamedTuple):
         """Return a score with its interval, drawn and written, and the range of the trainings."""
         value, low, high = row.interval(name)
         if math.isnan(value):
-            return Cell(NOTHING)
-        text, _, interval = with_interval(value, low, high).partition(" ")
+            return Cell(MISSING)
+        text, _, interval = format_interval(value, low, high).partition(" ")
         each = sorted(part.cells[name] for part in parts if part.is_ranked)
         if each:
-            spread = with_interval(value, each[0], each[-1]).partition(" ")[2].strip("()")
-            interval += f" each {spread or number(value)}"
+            spread = format_interval(value, each[0], each[-1]).partition(" ")[2].strip("()")
+            interval += f" each {spread or format_number(value)}"
         drawn = charts.sparkline((value, low, high), self.axes[name], mark=self.marks[name],
                                  each=each)
-        return Cell(text, value, drawn, small=interval.strip())
+        return Cell(text, value, drawn, note=interval.strip())
 
     def cells(self, row: MethodRow, parts: Sequence[MethodRow] = ()) -> dict[str, Cell]:
         """Return heading -> cell of each score with an interval."""
@@ -166,11 +166,11 @@ def _number_cells(row: MethodRow, names: Iterable[str]) -> dict[str, Cell]:
 def _rank_cell(row: MethodRow, shared: Counter[int | None]) -> Cell:
     rank = row.cells["rank"]
     if rank is None:
-        return Cell(NOTHING)
+        return Cell(MISSING)
     last = row.cells.get("last_rank", rank)
     if last > rank:
         return Cell(f"{rank}–{last}", float(rank))
-    return Cell(f"{rank}", float(rank), small="shared" if shared[rank] > 1 else "")
+    return Cell(f"{rank}", float(rank), note="shared" if shared[rank] > 1 else "")
 
 
 def method_cell(row: MethodRow, root: str, parts: Sequence[MethodRow] = (),
@@ -180,8 +180,8 @@ def method_cell(row: MethodRow, root: str, parts: Sequence[MethodRow] = (),
     title = row.cells["title"]
     badges = (*row.badges, *more)
     if parts:
-        return Cell(title, title.casefold(), small=f"mean of {len(parts)} trainings", badges=badges)
-    return Cell(title, title.casefold(), small=row.label, badges=badges,
+        return Cell(title, title.casefold(), note=f"mean of {len(parts)} trainings", badges=badges)
+    return Cell(title, title.casefold(), note=row.label, badges=badges,
                 link=f"{root}methods/{quote(row.cells['method'])}.html")
 
 
@@ -221,7 +221,7 @@ def page_table(board: Leaderboard, root: str, *, compact: bool = False) -> Table
         own = cells(row, (), of_rows)
         return TableRow([own[heading] for heading in made.headings], filter_flags(row))
 
-    return made._replace(rows=[row._replace(parts=tuple(map(part, line.parts)))
+    return made._replace(rows=[row._replace(children=tuple(map(part, line.parts)))
                                for row, line in zip(made.rows, together, strict=True)])
 
 
@@ -280,12 +280,12 @@ def run_table(board: Leaderboard, *, title: str = "title", drawn: bool = False) 
             cells["ẽ_c"] = mean_cell(episode_errors(row.record).values())
         if best:
             own, other = episode_errors(row.record), episode_errors(best.record)
-            cells[f"worse than {best.cells['method']} by"] = Cell(NOTHING) if row is best else (
+            cells[f"worse than {best.cells['method']} by"] = Cell(MISSING) if row is best else (
                 mean_cell(own[seed] - other[seed] for seed in own.keys() & other.keys()))
         cells |= _number_cells(row, others)
         if row.cells["skill"] is None and row.cells.get("contrast_error") is not None:
             without = 1.0 - row.cells["contrast_error"]
-            cells["skill"] = Cell(f"{number(without)}†", without)
+            cells["skill"] = Cell(f"{format_number(without)}†", without)
         rows.append(cells)
     keep = ["ẽ_c"] if board.category == "injection" else ["ẽ_c", "skill"]
     return Table.of(rows, label=board.title, keep=keep)
@@ -324,7 +324,7 @@ def terminal_tables(boards: Sequence[Leaderboard], characters: int) -> str:
             for row in table.rows])
         worse = [heading for heading in table.headings if heading.startswith("worse than ")]
         order = [*COLUMN_PRIORITY[:2], *worse, *COLUMN_PRIORITY[2:]]
-        shown = table.fitted(characters, order)
+        shown = table.fit_width(characters, order)
         left_out |= dict.fromkeys(heading for heading in table.headings
                                   if heading not in shown.headings)
         parts.append(f"{run_title(board)}\n\n{shown.markdown()}")
@@ -338,7 +338,7 @@ def terminal_tables(boards: Sequence[Leaderboard], characters: int) -> str:
 
 def markdown(boards: Sequence[Leaderboard]) -> str:
     """Return the tables of all boards as Markdown."""
-    return "\n\n".join(f"## {as_markdown(run_title(board))}\n\n{run_table(board).markdown()}"
+    return "\n\n".join(f"## {escape_markdown(run_title(board))}\n\n{run_table(board).markdown()}"
                        for board in boards) + "\n"
 
 

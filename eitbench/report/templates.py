@@ -15,7 +15,7 @@ from markdown_it import MarkdownIt
 from markupsafe import Markup, escape
 from PIL import Image
 
-from eitbench._foreign import cleaned
+from eitbench._sanitize import sanitize
 
 _DRAWING = ('<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 32 32">'
             '<rect y="5" width="32" height="22" rx="5" fill="#0b6e75"/>'
@@ -41,7 +41,7 @@ def _environment() -> jinja2.Environment:
 
 def _finalize(value: Any) -> Any:
     """Return text with control characters spelt out, and markup as it is."""
-    return cleaned(value, lines=True) if type(value) is str else value
+    return sanitize(value, lines=True) if type(value) is str else value
 
 
 def add_line_breaks(text: str) -> Markup:

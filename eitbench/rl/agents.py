@@ -25,7 +25,7 @@ class Agent:
     """
 
     model: ClassVar[Any]
-    masked: ClassVar[bool]
+    uses_action_masks: ClassVar[bool]
 
     @classmethod
     def suits(cls, rules: Rules) -> bool:
@@ -36,7 +36,7 @@ class Agent:
 
     def __init__(self, rules: Rules, random: np.random.Generator) -> None:
         self.rules = rules
-        self.memory = None
+        self.hidden_state = None
         self.onboard: OnboardFilter | None = None
 
     def act(self, observation: dict[str, np.ndarray]) -> Any:
@@ -48,12 +48,12 @@ class Agent:
         features = self.onboard.features()
         observation = observation | {name: array[0] for name, array in features.items()}
         masks = {}
-        if self.masked:
+        if self.uses_action_masks:
             spent = self.rules.budget is not None and observation["left"][1] == 0.0
             n = self.model.action_space.n
             masks["action_masks"] = np.arange(n) >= spent * (n - 1)
-        action, self.memory = self.model.predict(
-            flatten_scaled(self.rules, observation), state=self.memory,
+        action, self.hidden_state = self.model.predict(
+            flatten_scaled(self.rules, observation), state=self.hidden_state,
             episode_start=np.array([begins]), deterministic=True, **masks)
         return action
 
@@ -79,7 +79,8 @@ def load_agent(path: Path, content: bytes) -> tuple[str, str, type[Agent], dict[
     from eitbench.rl.training import ALGORITHMS
     algo, seed = asked["algo"], asked["seed"]
     model = ALGORITHMS[algo].load(io.BytesIO(content), device="cpu")
-    policy = type("Policy", (Agent,), {"model": model, "masked": algo.startswith("maskable")})
+    policy = type("Policy", (Agent,), {"model": model,
+                                       "uses_action_masks": algo.startswith("maskable")})
     built_in = (baseline_folder() / "checkpoints" / asked["env"].replace("/", "-") / algo
                 / f"seed{seed}" / "sha256")             # a copy elsewhere is built-in too
     is_built_in = built_in.is_file() and built_in.read_text().split()[:1] == [found]

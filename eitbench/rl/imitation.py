@@ -67,7 +67,7 @@ def imitate(model: Any, world: InjectionEnv, options: dict[str, Any], reward_sca
             _fit(model.policy, optimiser, seen, labels, returns, settings, random)
 
 
-def load_suited(argument: str, name: str, rules: Rules) -> Method:
+def load_compatible_policy(argument: str, name: str, rules: Rules) -> Method:
     """Load the policy of this name or path; ``ValueError`` if it does not suit the rules."""
     loaded = load_method(name, "injection")
     if not loaded.suits(rules):
@@ -89,7 +89,7 @@ def check_imitation(algo: str, options: dict[str, Any], rules: Rules) -> None:
     for name in ("rounds", "episodes", "epochs", "batch"):
         _check.integer(f"imitate.{name}", settings[name], low=1)
     _check.number("imitate.learning_rate", settings["learning_rate"], low=0.0, open_low=True)
-    load_suited("imitate.teacher", str(options["teacher"]), rules)
+    load_compatible_policy("imitate.teacher", str(options["teacher"]), rules)
 
 
 def rollout(world: InjectionEnv, method: Method, episode: int, random: np.random.Generator,

@@ -39,11 +39,11 @@ from threadpoolctl import threadpool_limits
 from tqdm import tqdm
 
 from eitbench import _check
-from eitbench._files import readable, write_atomically
+from eitbench._files import resolve_input, write_atomically
 from eitbench.data.cache import npy
 from eitbench.data.seeds import SPLITS
 from eitbench.envs.injection import InjectionEnv, InjectionVectorEnv
-from eitbench.rl.imitation import check_imitation, imitate, load_suited, rollout
+from eitbench.rl.imitation import check_imitation, imitate, load_compatible_policy, rollout
 from eitbench.rl.networks import MaskablePairPolicy, PairPolicy
 from eitbench.rl.vec_env import InjectionVecEnv
 from eitbench.worlds.registry import entries, entry
@@ -56,7 +56,7 @@ RESERVED = {"policy", "env", "seed", "device", "tensorboard_log", "_init_setup_m
 
 
 @dataclass(frozen=True)
-class Config:
+class TrainingConfig:
     """Entries of a configuration file."""
 
     total_steps: int
@@ -101,7 +101,7 @@ class Config:
                           open_low=True)
 
 
-def read_config(path: str | Path) -> Config:
+def read_config(path: str | Path) -> TrainingConfig:
     """Read a YAML file, in which entries without a value have their default; a built-in one, such
     as ``baselines/rl/ppo.yml``, is found from any folder.
 
@@ -109,10 +109,10 @@ def read_config(path: str | Path) -> Config:
     """
     import yaml
     try:
-        content = yaml.safe_load(readable(Path(path)).read_text())
+        content = yaml.safe_load(resolve_input(Path(path)).read_text())
     except (OSError, yaml.YAMLError) as error:
         raise ValueError(f"config must be a YAML file, got {str(path)!r}: {error}") from None
-    known = Config.__dataclass_fields__
+    known = TrainingConfig.__dataclass_fields__
     if not isinstance(content, dict) or not set(content) <= set(known):
         raise ValueError(
             f"config {str(path)!r} must hold entries of {', '.join(known)}; got {content!r}")
@@ -120,7 +120,7 @@ def read_config(path: str | Path) -> Config:
         raise ValueError(f"config {str(path)!r} must hold total_steps, got {content!r}")
     given: dict[str, Any] = {name: tuple(value) if isinstance(value, list) else value
                              for name, value in content.items() if value is not None}
-    return Config(**given)
+    return TrainingConfig(**given)
 
 
 @contextmanager
@@ -136,7 +136,7 @@ def _one_thread() -> Iterator[None]:
 
 
 @_one_thread()
-def train(env: str, algo: str, config: Config, seed: int, folder: Path,
+def train(env: str, algo: str, config: TrainingConfig, seed: int, folder: Path,
           kwargs: dict[str, Any] | None = None) -> Path:
     """Train an agent; return the path of its model.
 
@@ -183,12 +183,12 @@ def train(env: str, algo: str, config: Config, seed: int, folder: Path,
     # written only now that all cheap checks have passed
     write_atomically(settings, json.dumps(asked, indent=1).encode())
     if config.reference:
-        inner.reference = rewards_of(config.reference, world, folder / "reference.npy")
+        inner.reference = policy_rewards(config.reference, world, folder / "reference.npy")
     if is_new:
         if config.imitate:
             imitate(model, world, config.imitate, config.reward_scale, inner.reference, seed)
         _save(model, latest)
-    callback = _Checkpoints(folder, config.interval, evaluation(env, kwargs, config))
+    callback = _Checkpoints(folder, config.interval, make_evaluator(env, kwargs, config))
     if not (folder / "evaluations.npz").exists():
         callback.evaluate(model)
     if (left := config.total_steps - model.num_timesteps) > 0:
@@ -202,7 +202,7 @@ def train(env: str, algo: str, config: Config, seed: int, folder: Path,
     return made
 
 
-def vector_env(env: str, kwargs: dict[str, Any] | None, config: Config,
+def vector_env(env: str, kwargs: dict[str, Any] | None, config: TrainingConfig,
                n_envs: int | None = None) -> InjectionVectorEnv:
     """Build the vector environment; ``ValueError`` if ``env`` is no injection environment, or
     ``kwargs`` hold arguments that training sets."""
@@ -218,11 +218,11 @@ def vector_env(env: str, kwargs: dict[str, Any] | None, config: Config,
     return made
 
 
-def rewards_of(policy: str, world: InjectionEnv, path: Path) -> np.ndarray:
+def policy_rewards(policy: str, world: InjectionEnv, path: Path) -> np.ndarray:
     """(episodes, steps) rewards of a policy in every training episode; stored at ``path``."""
     if path.exists():
         return np.asarray(np.load(path))
-    method = load_suited("reference", policy, world.rules)
+    method = load_compatible_policy("reference", policy, world.rules)
     rewards = np.array([
         rollout(world, method, episode, np.random.default_rng(episode))[2]
         for episode in tqdm(range(world.pool.max_episodes), desc=f"rewards of {policy}",
@@ -232,8 +232,8 @@ def rewards_of(policy: str, world: InjectionEnv, path: Path) -> np.ndarray:
     return rewards
 
 
-def evaluation(env: str, kwargs: dict[str, Any] | None,
-               config: Config) -> Callable[[BaseAlgorithm], np.ndarray]:
+def make_evaluator(env: str, kwargs: dict[str, Any] | None,
+               config: TrainingConfig) -> Callable[[BaseAlgorithm], np.ndarray]:
     """Return a function that computes ẽ_c of a model's deterministic actions in each of the first
     dev episodes, with the reduced filter."""
     seeds: Any = list(SPLITS["dev"])[:config.evaluation_episodes]
@@ -259,7 +259,7 @@ def evaluation(env: str, kwargs: dict[str, Any] | None,
     return evaluate
 
 
-def _check_together(algo: str, config: Config, world: InjectionEnv) -> None:
+def _check_together(algo: str, config: TrainingConfig, world: InjectionEnv) -> None:
     """``ValueError`` if algorithm, configuration and environment do not match."""
     numbered = isinstance(world.action_space, spaces.Discrete)
     if algo in (("sac",) if numbered else ("dqn", "maskable_ppo")):
@@ -271,12 +271,12 @@ def _check_together(algo: str, config: Config, world: InjectionEnv) -> None:
         raise ValueError(f"algorithm must hold arguments of {algo}, {', '.join(sorted(known))}; "
                          f"got {', '.join(sorted(map(str, unknown)))}")
     if config.reference:
-        load_suited("reference", config.reference, world.rules)
+        load_compatible_policy("reference", config.reference, world.rules)
     if config.imitate:
         check_imitation(algo, config.imitate, world.rules)
 
 
-def _new_model(algo: str, config: Config, learning: VecEnv, seed: int,
+def _new_model(algo: str, config: TrainingConfig, learning: VecEnv, seed: int,
                how: dict[str, Any]) -> BaseAlgorithm:
     policy: Any = "MlpPolicy"
     if isinstance(learning.action_space, spaces.Discrete):

@@ -166,7 +166,7 @@ def entry(id: str, variant: str | None = None) -> Entry:
     """Return the entry of an id, or of the id's ``variant``; ``ValueError`` if it is unknown."""
     if id not in _entries:
         raise ValueError(f"env must be one of {', '.join(_entries)}; got {id!r}"
-                         + _check.nearest(id, _entries))
+                         + _check.did_you_mean(id, _entries))
     if variant is None:
         return _entries[id]
     variants: dict[str, Entry] = {}
@@ -175,7 +175,7 @@ def entry(id: str, variant: str | None = None) -> Entry:
             variants.setdefault(each.variant, each)
     if variant not in variants:
         raise ValueError(f"variant of {id} must be one of {', '.join(variants)}; got {variant!r}"
-                         + _check.nearest(variant, variants) if variants else
+                         + _check.did_you_mean(variant, variants) if variants else
                          f"{id} has no variants, got {variant!r}")
     return variants[variant]
 

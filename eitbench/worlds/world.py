@@ -444,7 +444,7 @@ def _changed(part: Any, changes: Mapping[str, Any], where: str) -> Any:
         name = current_field_name(given, known)
         if name not in known:
             raise ValueError(f"{where} has no {name!r}; there are {', '.join(known)}"
-                             + _check.nearest(name, known))
+                             + _check.did_you_mean(name, known))
         old = getattr(part, name)
         if is_dataclass(old) and isinstance(value, Mapping):
             made[name] = _changed(old, value, f"{where}.{name}")

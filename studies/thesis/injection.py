@@ -11,7 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from eitbench._files import shipped
+from eitbench._files import bundled_path
 from eitbench.bench.methods import baseline_folder
 from eitbench.bench.run import pending_jobs, run_jobs
 from eitbench.bench.store import EpisodeStore, folder_results
@@ -47,7 +47,7 @@ def injection(seeds: list[int] | None, jobs: int, out: Path) -> tuple[Path, str]
     minutes.
     """
     store = EpisodeStore(out)
-    recorded = folder_results(shipped("leaderboards") / "results")
+    recorded = folder_results(bundled_path("leaderboards") / "results")
     figure = Figure(figsize=(13.5, 13.8), dpi=110, layout="constrained")
     panels = figure.subplots(3, 3, height_ratios=(4, 4, 3))
     tables = []

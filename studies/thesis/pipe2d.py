@@ -12,7 +12,7 @@ from threadpoolctl import threadpool_limits
 from eitbench import scoring
 from eitbench.bench.methods import load_method
 from eitbench.bench.runner import run_estimator
-from eitbench.bench.scores import scored
+from eitbench.bench.scores import compute_scores
 from eitbench.data.episode_cache import score_operators
 from eitbench.envs.estimation import EstimationEnv
 from eitbench.envs.rendering import STD_COLORMAP, colour_range, draw_field
@@ -162,7 +162,7 @@ def _filter_scores(velocity: float, seeds: list[int]) -> list[dict[str, float]]:
     env = _env(mean_velocity=float(velocity))
     with threadpool_limits(1):
         kalman_filter = load_method("kalman_filter", "estimation")
-        return [scored("estimation", run_estimator(env, kalman_filter, seed).outcome)
+        return [compute_scores("estimation", run_estimator(env, kalman_filter, seed).outcome)
                 for seed in seeds]
 
 

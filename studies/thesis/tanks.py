@@ -16,7 +16,7 @@ from eitbench.envs.rendering import draw_field
 from eitbench.estimation import CalibrationFrame
 from eitbench.numerics.fem import mass_matrix
 from eitbench.numerics.mesh import Mesh
-from eitbench.scoring import deficit_centre
+from eitbench.scoring import deficit_centroid
 from eitbench.worlds.random_streams import episode_streams
 from eitbench.worlds.task import Estimate, Task
 from eitbench.worlds.world import World
@@ -153,7 +153,7 @@ def _distances(env: EstimationEnv, estimates: list[Estimate], centres: np.ndarra
     """Return the distances (T,) in m of the estimated from the true centre of the disc."""
     mesh = env.task.mesh
     weights = mass_matrix(mesh).sum(axis=1)
-    estimated = np.array([deficit_centre(estimate.mean, mesh.points, weights)
+    estimated = np.array([deficit_centroid(estimate.mean, mesh.points, weights)
                        for estimate in estimates])
     return np.hypot(*(estimated - centres).T)
 

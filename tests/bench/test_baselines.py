@@ -16,7 +16,7 @@ def test_our_baselines_load():
         *builtin_methods("estimation")}
     for name in builtin_methods("estimation"):
         baseline = load_method(name, "estimation")
-        assert baseline.name == name and baseline.title and baseline.boards and len(baseline.sha256) == 64
+        assert baseline.name == name and baseline.title and baseline.subtracks and len(baseline.sha256) == 64
         assert strict(json.dumps(baseline.parameters)) == baseline.parameters
     ours = [load_method(name, track) for track in ("estimation", "injection") for name in builtin_methods(track)]
     roles = {method.name: method.role for method in ours if method.role}

@@ -5,21 +5,21 @@ import re
 
 import pandas as pd
 import pytest
-from eitbench._files import shipped
+from eitbench._files import bundled_path
 from eitbench.bench import load
-from eitbench.bench.episode_table import NAME, episode_table, read_episode_table, write_episode_table
+from eitbench.bench.episode_table import TABLE_NAME, episode_table, read_episode_table, write_episode_table
 from eitbench.bench.records import read_records, split_outdated, write_record
 from eitbench.report import compare
 from eitbench.report.boards import anchors, bundled_anchors
 
 from tiny import several_boards
 
-RESULTS = shipped("leaderboards") / "results"
+RESULTS = bundled_path("leaderboards") / "results"
 
 
 def test_the_published_table_is_that_of_the_records():
     """`eitbench leaderboard --records leaderboards/results` would change nothing, and `load` gives one frame."""
-    text = gzip.decompress((RESULTS.parent / NAME).read_bytes()).decode()
+    text = gzip.decompress((RESULTS.parent / TABLE_NAME).read_bytes()).decode()
     assert text == episode_table(read_records(RESULTS)), "run `eitbench leaderboard --records leaderboards/results`"
     pd.testing.assert_frame_equal(load(RESULTS.parent / "none"), load(), check_exact=True)
 
@@ -35,8 +35,8 @@ def test_published_records_name_no_folder_of_a_machine():
 def test_records_come_back(tmp_path):
     """All that a comparison needs: floors, failures, odd names, scores that are missing."""
     written = several_boards()
-    write_episode_table(written, tmp_path / NAME)
-    read = read_episode_table(tmp_path / NAME)
+    write_episode_table(written, tmp_path / TABLE_NAME)
+    read = read_episode_table(tmp_path / TABLE_NAME)
     assert [each["method"] for each in read] == [each["method"] for each in written]
     for made, found in zip(written, read, strict=True):
         assert all(found[name] == made[name] for name in found if name != "episodes")
@@ -54,7 +54,7 @@ def test_records_come_back(tmp_path):
 def test_compare_and_skill_need_no_records(tmp_path, monkeypatch):
     """Where only the table is, methods are compared as in a checkout."""
     folder = tmp_path / "results"
-    (tmp_path / NAME).write_bytes((RESULTS.parent / NAME).read_bytes())
+    (tmp_path / TABLE_NAME).write_bytes((RESULTS.parent / TABLE_NAME).read_bytes())
 
     def compared():
         pair = [compare.find_records(name, tmp_path / "mine") for name in ("kalman_filter", "extended_kalman_filter")]
@@ -72,7 +72,7 @@ def test_compare_and_skill_need_no_records(tmp_path, monkeypatch):
     lambda data: gzip.compress(gzip.decompress(data)[:-3] + b"x,y\n")])
 def test_a_damaged_table_is_named(damage, tmp_path):
     """With its path."""
-    write_episode_table(several_boards(), tmp_path / NAME)
-    (tmp_path / NAME).write_bytes(damage((tmp_path / NAME).read_bytes()))
-    with pytest.raises(ValueError, match=rf"table of episodes .*{NAME} cannot be read"):
+    write_episode_table(several_boards(), tmp_path / TABLE_NAME)
+    (tmp_path / TABLE_NAME).write_bytes(damage((tmp_path / TABLE_NAME).read_bytes()))
+    with pytest.raises(ValueError, match=rf"table of episodes .*{TABLE_NAME} cannot be read"):
         load(tmp_path / "results")

@@ -10,12 +10,12 @@ import json
 import pytest
 from eitbench.bench import golden, methods
 from eitbench.bench.methods import baseline_folder
-from eitbench.bench.tracks import own_ids
+from eitbench.bench.tracks import builtin_ids
 from eitbench.worlds import entry
 
 from commands import eitbench
 
-IDS = own_ids()
+IDS = builtin_ids()
 FLUIDS = list(dict.fromkeys(entry(id).world.truth_config for id in IDS))
 BY_FLUID = sorted(IDS, key=lambda id: FLUIDS.index(entry(id).world.truth_config))
 METHODS = golden.golden_methods()

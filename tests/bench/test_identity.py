@@ -91,9 +91,10 @@ def test_a_changed_default_is_another_identity(monkeypatch):
 
     def changed_class(name, *, world=None, estimator="reduced", observation="scaled", gate=9.0): ...
 
-    changes = [lambda patch: patch.setitem(tracks.SCORED, "injection", {"estimator": "reduced", "observation": "raw"}),
+    changes = [lambda patch: patch.setitem(tracks.RUN_KWARGS, "injection",
+                                             {"estimator": "reduced", "observation": "raw"}),
                lambda patch: patch.setattr(tracks, "load_env_creator", lambda name: changed_class),
-               lambda patch: patch.setattr(tracks, "registered", lambda id: {"gate": 4.0}),
+               lambda patch: patch.setattr(tracks, "registered_kwargs", lambda id: {"gate": 4.0}),
                lambda patch: patch.setattr(run, "SCORING", 99)]
     found = {before}
     for change in changes:

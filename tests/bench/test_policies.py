@@ -46,7 +46,7 @@ def actions_of(name: str, policy: str, monkeypatch) -> list[np.ndarray]:
         played = injected(name, KWARGS[name], policy, SEED, "reduced")
     assert len(taken) == env.core.length
     budget = env.rules.budget
-    assert played.spent <= (len(taken) if budget is None else budget)
+    assert played.n_injections <= (len(taken) if budget is None else budget)
     assert len(played.errors) == env.world.schedule.scored_steps
     assert 0.0 < played.errors.mean() < 1.0 and played.seconds_per_step >= 0.0
     return taken
@@ -214,7 +214,7 @@ def test_played_episodes_are_kept(tmp_path, monkeypatch):
     record, _ = store.write_records()
     assert (record["board"], record["method"], record["seeds"]) == ("injection", "adjacent", ["dev:0", "dev:1"])
     assert record["environment"]["kwargs"]["estimator"] == "reduced"
-    assert record["episodes"][0]["scores"]["spent"] == played.spent > 0
+    assert record["episodes"][0]["scores"]["spent"] == played.n_injections > 0
     assert record["episodes"][0]["step_errors"] == played.errors.tolist()
 
     next(store.folder.glob("episodes/*/opposite/dev-1.json")).write_text("{")

@@ -8,7 +8,7 @@ import pytest
 from eitbench import scoring
 from eitbench.bench import runner
 from eitbench.bench.methods import load_method
-from eitbench.bench.scores import Outcome, scored
+from eitbench.bench.scores import Outcome, compute_scores
 from eitbench.bench.tracks import Environment
 from eitbench.bench.verify import score_differences
 from eitbench.data.episode_cache import mass_between
@@ -58,7 +58,7 @@ def test_claims_are_those_of_the_filter_inside(name):
     weights = np.asarray(mass.sum(axis=0)).ravel()
     claim = [np.array([onto @ state for state in seen[key]]) for key in ("mean", "std")]
     claim = [*claim, np.array(seen["truth"]), weights]
-    said = scored("injection", played.outcome)
+    said = compute_scores("injection", played.outcome)
     assert played.outcome.errors.tolist() == seen["error"]
     assert 0 < len(seen["nis"]) <= len(seen["error"]) == env.world.schedule.scored_steps
     expected = {"nis": np.mean(seen["nis"]), "crps": scoring.crps(*claim),
@@ -73,9 +73,9 @@ def test_only_used_readings_count():
     """Two readings and then one: (4/1 + 4/4)/2 = 2.5 and 9/1 = 9 have a mean of 5.75."""
     innovations = ([np.array([2.0, 2.0]), np.array([3.0])], [np.diag([1.0, 4.0]), np.eye(1)])
     outcome = Outcome(entry(NAME).world, 0.0, np.ones(2), innovations=innovations)
-    assert scored("injection", outcome)["nis"] == pytest.approx(5.75)
+    assert compute_scores("injection", outcome)["nis"] == pytest.approx(5.75)
     silent = Outcome(entry(NAME).world, 0.0, np.ones(2))
-    assert [scored("injection", silent)[name] for name in CLAIMS] == [None] * 5
+    assert [compute_scores("injection", silent)[name] for name in CLAIMS] == [None] * 5
 
 
 def test_a_policy_sees_nothing_of_it():

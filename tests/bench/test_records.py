@@ -22,7 +22,7 @@ from eitbench.bench.records import (
     with_content_hash,
     write_record,
 )
-from eitbench.bench.tracks import ARGUMENTS, boards_of, named
+from eitbench.bench.tracks import ENV_KWARGS, environment_name, subtracks_of
 from eitbench.envs.estimation import EstimationEnv
 from eitbench.envs.injection import InjectionEnv
 from eitbench.worlds import entry
@@ -263,8 +263,8 @@ TOO_LONG = entry(PIPE).world.n_steps - 1
     ("eitbench/Pipe2DInjection-v0", {"gate": 3.0}, "injection")])
 def test_a_board_is_that_of_the_environment(id, kwargs, boards, tmp_path):
     """Whatever the record calls it."""
-    assert boards_of(id, kwargs) == tuple(boards.split())
-    environment = {"id": id, "name": named(id, kwargs), "kwargs": kwargs}
+    assert subtracks_of(id, kwargs) == tuple(boards.split())
+    environment = {"id": id, "name": environment_name(id, kwargs), "kwargs": kwargs}
     for board in BOARDS:
         made = record("mine", [0.1], board=board, environment=environment)
         if board in boards.split():
@@ -281,7 +281,7 @@ def test_a_board_is_that_of_the_environment(id, kwargs, boards, tmp_path):
     ({"lag": "some"}, "lag must be"), ({"lag": {}}, "lag must be")])
 def test_arguments_that_there_are_not(kwargs, message, tmp_path):
     """No run could have had them."""
-    environment = {"id": PIPE, "name": named(PIPE, kwargs), "kwargs": kwargs}
+    environment = {"id": PIPE, "name": environment_name(PIPE, kwargs), "kwargs": kwargs}
     with pytest.raises(ValueError, match=rf"\$\.environment\.kwargs: {message}"):
         read_record(write_unchecked(tmp_path, record("mine", [0.1], environment=environment)))
 
@@ -289,7 +289,7 @@ def test_arguments_that_there_are_not(kwargs, message, tmp_path):
 def test_the_arguments_are_those_of_the_environments():
     """And no others."""
     for track, single in (("estimation", EstimationEnv), ("injection", InjectionEnv)):
-        assert sorted(ARGUMENTS[track]) == sorted(set(signature(single).parameters) - {"name", "variant"})
+        assert sorted(ENV_KWARGS[track]) == sorted(set(signature(single).parameters) - {"name", "variant"})
 
 
 @pytest.mark.parametrize("text", ["1e999", "-1e999", "NaN", "Infinity", "9" * 400, "9" * 5000, '"\\ud800"',

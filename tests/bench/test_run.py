@@ -14,7 +14,7 @@ from eitbench.bench.outcomes import EstimatorOutput
 from eitbench.bench.run import Job, run_episode, run_jobs
 from eitbench.bench.runner import run_estimator
 from eitbench.bench.store import EpisodeStore
-from eitbench.bench.tracks import Environment, board_of
+from eitbench.bench.tracks import Environment, subtrack_of
 from eitbench.data.cache import CACHE_VARIABLE
 from eitbench.data.episodes import cached_truth_model, simulate
 from eitbench.worlds.catalogue import PIPE_2D
@@ -187,7 +187,7 @@ def test_estimators_cannot_spoil_the_task_for_others(tmp_path):
 def test_estimates_are_taken_for_the_state_that_was_asked_for(environment, board):
     """At step i the state t = i − lag is asked for: on each board what was said of t stands at t."""
     env = environment.make()
-    assert board_of(env) == board
+    assert subtrack_of(env) == board
 
     def update(task, i, *_):
         return Estimate(np.full(1701, 20.0 + i - task.lag)) if i > task.lag else None

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from eitbench.bench import scores
 from eitbench.bench.records import read_records
-from eitbench.bench.scores import Outcome, Score, register_score, scored
+from eitbench.bench.scores import Outcome, Score, compute_scores, register_score
 from eitbench.report import compare
 from eitbench.report.boards import run_leaderboards
 from eitbench.report.site import collect, render, render_site
@@ -37,7 +37,7 @@ def outcome(**given):
 
 def test_numbers_by_hand():
     """ẽ_c is the mean of the steps' errors; the contrast is 1/4 and 12/4 of ∫(c − 3)² = 4."""
-    said = scored("estimation", outcome())
+    said = compute_scores("estimation", outcome())
     assert said["error"] == pytest.approx(0.2) and said["seconds_per_step"] == 0.5
     assert said["contrast_error"] == pytest.approx(0.5 * (1 / 4 + 12 / 4))
     assert [said[name] for name in ("nis", "crps", "coverage_50", "velocity_error")] == [None] * 4
@@ -48,26 +48,26 @@ def test_innovations_and_velocity_where_they_are_claimed():
     """ν = (2, 0) with S = diag(1, 4) has NIS/m = 2; a velocity 10 % too high everywhere has 0.01."""
     innovations = np.array([[2.0, 0.0]]), np.diag([1.0, 4.0])[None]
     velocity = np.full((2, 3), 1.1), np.ones((2, 3)), np.full(3, 0.2)
-    said = scored("estimation", outcome(innovations=innovations, velocity=velocity))
+    said = compute_scores("estimation", outcome(innovations=innovations, velocity=velocity))
     assert said["nis"] == pytest.approx(2.0) and said["velocity_error"] == pytest.approx(0.01)
 
 
 def test_policies_have_theirs():
     """Error, injections, time, and of what the filter claims nothing where nobody asked it."""
-    said = scored("injection", Outcome(WORLD, 0.5, np.array([0.1, 0.3]), spent=7))
+    said = compute_scores("injection", Outcome(WORLD, 0.5, np.array([0.1, 0.3]), n_injections=7))
     claims = dict.fromkeys(("nis", "crps", "coverage_50", "coverage_90", "spread_ratio"))
     assert said == claims | {"error": pytest.approx(0.2), "spent": 7.0, "seconds_per_step": 0.5}
 
 
-def worst(better="lower"):
+def worst(direction="lower"):
     return Score("worst_step", "worst", "the worst step", lambda outcome: outcome.errors.max(),
-                 better=better, factor=100.0)
+                 direction=direction, factor=100.0)
 
 
 def test_a_new_score_is_shown_everywhere(apart):
     """One call, and it is in episodes, summaries, CSV, Markdown, pages and comparisons, in its unit."""
     register_score(worst())
-    assert scored("estimation", outcome())["worst_step"] == pytest.approx(0.3)
+    assert compute_scores("estimation", outcome())["worst_step"] == pytest.approx(0.3)
     records = [record for record in read_records(PUBLISHED)
                if record["environment"]["name"] == "eitbench-Pipe2D-v0"
                and record["method"] in ("kalman_filter", "homogeneous")]
@@ -134,6 +134,6 @@ def test_a_score_that_is_no_number_is_refused(apart):
     """It is named; None means that there is nothing to be said."""
     register_score(Score("mine", "mine", "", lambda outcome: np.nan))
     with pytest.raises(ValueError, match="score mine"):
-        scored("estimation", outcome())
+        compute_scores("estimation", outcome())
     register_score(Score("yours", "yours", "", lambda outcome: None))
     assert scores.scores()["yours"](outcome()) is None

@@ -16,7 +16,7 @@ from eitbench.bench.statistics import (
     paired_difference,
     paired_probability_of_improvement,
     stratified_bootstrap,
-    tail,
+    tail_percent,
 )
 from scipy import stats
 
@@ -79,7 +79,7 @@ def test_coverage(n, statistic, expected):
     repeats, random = 1000, np.random.default_rng(11)
     held = 0
     for _ in range(repeats):
-        _, low, high = stratified_bootstrap({"pipe": random.normal(3.0, 2.0, n)}, statistic, draws=1000)
+        _, low, high = stratified_bootstrap({"pipe": random.normal(3.0, 2.0, n)}, statistic, n_resamples=1000)
         held += low <= 3.0 <= high
     assert held / repeats == pytest.approx(expected, abs=3 * math.sqrt(expected * (1 - expected) / repeats))
 
@@ -92,7 +92,7 @@ def test_coverage_over_environments():
     random, held, width = np.random.default_rng(12), 0, []
     for _ in range(400):
         scores = {"a": random.normal(0.0, 1.0, 30), "b": random.normal(50.0, 2.0, 40), "c": random.normal(9.0, 1.0, 25)}
-        _, low, high = stratified_bootstrap(scores, mean_over_environments, draws=1000)
+        _, low, high = stratified_bootstrap(scores, mean_over_environments, n_resamples=1000)
         held += low <= 59 / 3 <= high
         width.append(high - low)
     assert held / 400 == pytest.approx(0.95, abs=0.033)
@@ -150,7 +150,7 @@ def test_paired_interval_is_scipys():
     theirs = stats.bootstrap((x, y), lambda x, y, axis: (x - y).mean(axis=axis), paired=True, method="percentile",
                              confidence_level=1 - 2 * cut, n_resamples=20_000,
                              rng=np.random.default_rng(4)).confidence_interval
-    value, low, high = paired_difference({"pipe": seeded(x)}, {"pipe": seeded(y)}, draws=20_000)
+    value, low, high = paired_difference({"pipe": seeded(x)}, {"pipe": seeded(y)}, n_resamples=20_000)
     assert value == pytest.approx((x - y).mean(), rel=1e-12)
     sd = (x - y).std() / math.sqrt(40)                           # Monte-Carlo error of an end of the interval: 0.02 sd
     assert (low, high) == pytest.approx(tuple(theirs), abs=4 * math.sqrt(2) * 0.02 * sd)
@@ -167,7 +167,7 @@ def test_paired_difference_of_interquartile_means():
         differences.append(x - y)
     value, low, high = paired_difference(a, b, statistic=interquartile_mean)
     assert value == interquartile_mean(*plain(a).values()) - interquartile_mean(*plain(b).values())
-    cut = tail((12, 20, 9))
+    cut = tail_percent((12, 20, 9))
     theirs = tuple(np.percentile(differences, [cut, 100 - cut]))
     assert (low, high) == pytest.approx(theirs, abs=4 * 0.05 * np.std(differences))
     assert paired_difference(shuffled(a, random), shuffled(b, random), statistic=interquartile_mean) == (
@@ -256,7 +256,7 @@ def by_the_definition(scores, unranked, statistic, higher):
     ranked = [name for name in scores if name not in unranked]
     ranks = dict.fromkeys(scores)
     for name in ranked:
-        others = [paired_difference(scores[name], scores[other], statistic=statistic, draws=500) for other in ranked]
+        others = [paired_difference(scores[name], scores[other], statistic=statistic, n_resamples=500) for other in ranked]
         ranks[name] = 1 + sum(high < 0 if higher else low > 0 for _, low, high in others)
     return ranks
 
@@ -281,7 +281,7 @@ def test_ranks_are_those_of_the_definition(statistic, higher):
     for seed in range(12):
         scores, unranked = a_board(seed), {"m1"} if seed % 2 else set()
         listed = {name: shuffled(scores[name], np.random.default_rng(seed)) for name in reversed(scores)}
-        found = shared_ranks(listed, unranked, statistic=statistic, higher_is_better=higher, draws=500)
+        found = shared_ranks(listed, unranked, statistic=statistic, higher_is_better=higher, n_resamples=500)
         assert found == by_the_definition(scores, unranked, statistic, higher), seed
         values = [statistic(*(list(own.values()) for own in scores[name].values())) for name in found]
         assert values == pytest.approx(sorted(values, reverse=higher), rel=1e-12)
@@ -299,7 +299,7 @@ def test_ranks_are_those_of_the_definition(statistic, higher):
     (lambda: stratified_bootstrap({"pipe": np.ones((3, 3))}, interquartile_mean), "scores_by_stratum must hold"),
     (lambda: stratified_bootstrap({"pipe": [1.0, math.nan]}, interquartile_mean), "scores_by_stratum must hold finite"),
     (lambda: stratified_bootstrap({"pipe": NOISE}, np.mean), "statistic must reduce the last axis only"),
-    (lambda: stratified_bootstrap({"pipe": NOISE}, interquartile_mean, draws=0), "draws must be at least 1"),
+    (lambda: stratified_bootstrap({"pipe": NOISE}, interquartile_mean, n_resamples=0), "n_resamples must be at least 1"),
     (lambda: paired_difference({"pipe": seeded(NOISE)}, {"pipe": seeded(NOISE, "dev")}), "a and b must share a seed"),
     (lambda: paired_difference({"pipe": seeded(NOISE)}, {"tank": seeded(NOISE)}), "environments must be the same"),
     (lambda: paired_difference({}, {}), "a and b must hold finite scores"),

@@ -189,7 +189,8 @@ def test_a_record_is_extended(official, tmp_path):
 
 def test_a_result_that_no_record_may_hold_is_not_submitted(tmp_path, monkeypatch):
     """It is named, and nothing is written."""
-    monkeypatch.setattr(run, "scored", lambda *asked, scored=run.scored: scored(*asked) | {"seconds_per_step": -1.0})
+    monkeypatch.setattr(run, "compute_scores", lambda *asked, compute=run.compute_scores: (
+        compute(*asked) | {"seconds_per_step": -1.0}))
     with pytest.warns(UserWarning, match=r"homogeneous/test-0\.json is left out: it is not valid: .*seconds_per_step"):
         code, _, complaint = eitbench("submit", "--baseline", "homogeneous", "--env", FILTER.id, "--seeds", "test:0",
                                       "-j", "1")

@@ -92,10 +92,10 @@ def test_leaderboard_writes_the_same_again(tmp_path):
 def test_every_board_by_default(tmp_path):
     """Without --env a baseline plays every environment of the quick suite that is of its boards."""
     (tmp_path / "mine.py").write_text(MINE.replace("class Estimator:", "class Estimator:\n"
-                                                   "    boards = ('filter', 'fixed-lag', 'smoothing')"))
+                                                   "    subtracks = ('filter', 'fixed-lag', 'smoothing')"))
     code, said, _ = eitbench("run", "--baseline", "mine.py", "--seeds", "dev:0", "-j", "1")
-    boards = ("filter", "fixed-lag", "smoothing")
-    assert code == 0 and [said.count(f", {board}, dev:0\n") for board in boards] == [1, 1, 1]
+    subtracks = ("filter", "fixed-lag", "smoothing")
+    assert code == 0 and [said.count(f", {board}, dev:0\n") for board in subtracks] == [1, 1, 1]
 
 
 def test_suites():

@@ -3,7 +3,7 @@
 import re
 
 import pytest
-from eitbench.bench.variants import flat, variants
+from eitbench.bench.variants import flatten, variants
 from eitbench.cli.app import app
 from eitbench.report.sweep import swept_parameter
 from typer.testing import CliRunner
@@ -111,7 +111,7 @@ def test_a_sweep_has_a_table_and_a_chart(tmp_path):
 def test_variants(settings, worlds):
     """Words become what `world=` takes; one number that differs is swept, two are not."""
     assert variants(settings) == worlds
-    differ = {key for key in flat(worlds[0]) if len({str(flat(world)[key]) for world in worlds}) > 1}
+    differ = {key for key in flatten(worlds[0]) if len({str(flatten(world)[key]) for world in worlds}) > 1}
     assert swept_parameter(worlds) == (differ.pop() if len(differ) == 1 else None)
 
 

@@ -4,7 +4,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from eitbench.bench.package_data import difference, expected_files, unused_files
-from eitbench.bench.tracks import own_ids
+from eitbench.bench.tracks import builtin_ids
 from eitbench.data import cache, episodes
 from eitbench.data.cache import load_shipped
 from eitbench.data.episode_cache import prefix_file, region_file, scoring_constants_file
@@ -12,7 +12,7 @@ from eitbench.estimation.onboard.models import pack_model, reduced_model_key, un
 from eitbench.estimation.reduced import ReducedModel
 from eitbench.worlds import entry
 
-EXPECTED = expected_files(own_ids())
+EXPECTED = expected_files(builtin_ids())
 CHEAP = {file(entry("eitbench/Pipe2D-v0").world).key for file in (scoring_constants_file, prefix_file)}
 
 
@@ -63,7 +63,7 @@ def test_a_file_belongs_to_its_numbers(key, same, other):
     assert all(key(world.with_changes(change)) != key(world) for change in other)
 
 
-@pytest.mark.parametrize("id", [id for id in own_ids() if entry(id).world.warm_up])
+@pytest.mark.parametrize("id", [id for id in builtin_ids() if entry(id).world.warm_up])
 def test_the_first_reset_simulates_nothing(id, monkeypatch, tmp_path):
     monkeypatch.setenv(cache.CACHE_VARIABLE, str(tmp_path))
     monkeypatch.setattr(episodes, "cached_truth_model", None)

@@ -4,7 +4,7 @@ import copy
 
 import numpy as np
 import pytest
-from eitbench.bench.scores import Outcome, scored
+from eitbench.bench.scores import Outcome, compute_scores
 from eitbench.estimation.onboard.linearisation import LinearisationTable
 from eitbench.estimation.onboard.reduced_filters import ReducedFilters, SharedData
 
@@ -100,7 +100,7 @@ def nis_of(random, noise: float) -> float:
         operator.assimilate(voltages, np.repeat(currents[None], B, axis=0))
         seen += operator.innovations()
     innovations = [each.value for each in seen], [each.covariance for each in seen]
-    return scored("injection", Outcome(world, 0.0, np.zeros(1), innovations=innovations))["nis"]
+    return compute_scores("injection", Outcome(world, 0.0, np.zeros(1), innovations=innovations))["nis"]
 
 
 def test_nis_of_a_consistent_filter_averages_one(monkeypatch):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from eitbench import Estimate
 from eitbench.bench.runner import run_estimator
-from eitbench.bench.scores import scored
+from eitbench.bench.scores import compute_scores
 from estimation_envs import PIPE, SKEWED, VELOCITY, make
 
 
@@ -31,7 +31,7 @@ def test_leaderboard_scores_what_is_rewarded(name, said, monkeypatch):
 
     monkeypatch.setattr(base, "step", watched)
     baseline = SimpleNamespace(make=lambda _: estimator, privileged=False)
-    scores = scored("estimation", run_estimator(base, baseline, 1).outcome)
+    scores = compute_scores("estimation", run_estimator(base, baseline, 1).outcome)
     rewards = np.array([reward for _, (_, reward, *_) in played])[task.warm_up:]
     total = scores["error"] + scores["velocity_error"]
     assert total == pytest.approx(-rewards.mean(), abs=1e-7)

@@ -12,7 +12,7 @@ import pytest
 from eitbench.bench import load
 from eitbench.bench.records import read_records, write_record
 from eitbench.bench.statistics import interquartile_mean, stratified_bootstrap
-from eitbench.bench.tracks import named
+from eitbench.bench.tracks import environment_name
 from eitbench.report.boards import ALL, boards, record_category
 from eitbench.report.site import collect, render
 
@@ -305,7 +305,8 @@ def official_rows(records):
     [record("true_model_smoother", times(9.0), version="v99", role="reference")],
     [record("homogeneous", times(0.01), version="v1", role="floor", finished="9999-12-31", id="eitbench/Pipe3D-v0")],
     [record("homogeneous", times(0.01), board="smoothing", role="floor", environment={
-        "id": BOARD_IDS["filter"], "name": named(BOARD_IDS["filter"], {"lag": "all"}), "kwargs": {"lag": "all"}})],
+        "id": BOARD_IDS["filter"],
+            "name": environment_name(BOARD_IDS["filter"], {"lag": "all"}), "kwargs": {"lag": "all"}})],
     [record("c", times(0.9), runs=[RUN | {"machine": RUN["machine"] | {"matmul_seconds": 1e-9}}] * 99)],
 ], ids=["floor", "method", "reference", "elsewhere", "anchor of the skill", "matrix products"])
 def test_a_self_reported_record_changes_no_official_number(strangers):

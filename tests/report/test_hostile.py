@@ -4,10 +4,10 @@ import re
 from pathlib import Path
 
 import pytest
-from eitbench._foreign import cleaned
+from eitbench._sanitize import sanitize
 from eitbench.bench.records import read_records, with_content_hash, write_record
 from eitbench.bench.store import EpisodeStore
-from eitbench.bench.tracks import named
+from eitbench.bench.tracks import environment_name
 from eitbench.cli.app import app
 from eitbench.report.boards import run_leaderboards
 from eitbench.report.page import write_page
@@ -29,7 +29,8 @@ def hostile(text):
     given = {"assume": {text: text}}
     machine = RUN["machine"] | {"processor": text}
     odd = record("odd", [0.2, 0.1, None], title=text, parameters={text: text}, runs=[RUN | {
-        "command": text, "machine": machine}], environment={"id": id, "name": named(id, given), "kwargs": given})
+        "command": text, "machine": machine}], environment={
+            "id": id, "name": environment_name(id, given), "kwargs": given})
     plain = record("plain", [0.1, 0.2, 0.1], title=text)
     for episode in odd["episodes"]:
         if episode["status"] != "ok":
@@ -51,7 +52,7 @@ def test_text_stays_text(text, tmp_path):
         assert not any("http://x" in address for name in ("src", "href") for address in parsed.attributes(name))
         assert [tag for tag, _ in parsed.tags].count("script") == 1 and "49" not in re.findall(r">(49)<", page)
         assert not re.search(r"<b>\s*[^\d−-]", page), path
-    assert cleaned(text) in "".join(Page(pages["methods/odd.html"].replace("<wbr/>", "")).text)
+    assert sanitize(text) in "".join(Page(pages["methods/odd.html"].replace("<wbr/>", "")).text)
     texts = render(site)
     markdown = texts["leaderboard.md"]
     assert not re.search(UNSEEN, markdown)

@@ -5,7 +5,7 @@ import re
 
 import numpy as np
 import pytest
-from eitbench.bench.text import mean_and_interval, number, rounded, seed_ranges, with_interval
+from eitbench.bench.text import format_interval, format_mean, format_number, mean_and_interval, seed_ranges
 from eitbench.report.boards import environment_title, run_leaderboards, world_key
 from eitbench.report.tables import markdown, run_table, terminal_tables
 from hypothesis import given
@@ -54,14 +54,14 @@ def test_interval_is_students(values):
 ])
 def test_rounded_examples(mean, half, text):
     """The interval has one significant digit, two after a 1; the mean ends at the same place."""
-    assert rounded(mean, half) == text
+    assert format_mean(mean, half) == text
 
 
 @given(st.floats(1e-3, 100.0), st.floats(1.01e-5, 1.0))
 def test_rounding_stays_within_the_interval(mean, part):
     """Read back, the mean lies within the interval, which is right to a third; both end at the same decimal place."""
     half = max(part * mean, 1.01e-5)
-    shown = rounded(mean, half)
+    shown = format_mean(mean, half)
     match = re.fullmatch(r"(\d+(?:\.(\d+))?) ± (\d+(?:\.(\d+))?)", shown)
     assert match, shown
     assert abs(float(match[1]) - mean) <= half / 2
@@ -72,7 +72,7 @@ def test_rounding_stays_within_the_interval(mean, part):
 @pytest.mark.parametrize(("value", "text"), [(0.01234, "0.012"), (1.234, "1.23"), (29.47, "29.5"), (999.4, "999"),
                                            (999.6, "1000"), (3078.2, "3078"), (0.0, "0"), (-1.234, "-1.23")])
 def test_numbers_are_short_and_never_powers_of_ten(value, text):
-    assert number(value) == text
+    assert format_number(value) == text
 
 
 # -- skill ------------------------------------------------------------------------------------------------------------
@@ -166,7 +166,7 @@ def test_failures_are_counted_not_averaged():
     (board,) = run_leaderboards([made("mine", "filter", [0.1, 0.2, None]), made("bad", "filter", [None])])
     text = said(run_table(board))
     assert list(text["seeds"]) == ["test:0-2, 1 failed", "test:0, 1 failed"] and list(text["ẽ_c"])[1] == "–"
-    assert text["ẽ_c"][0] == rounded(*mean_and_interval([0.1, 0.2]))
+    assert text["ẽ_c"][0] == format_mean(*mean_and_interval([0.1, 0.2]))
 
 
 def test_units_and_missing_values():
@@ -182,7 +182,7 @@ def test_the_drawn_table_has_bootstrap_intervals():
     """From six episodes on; the numbers are those of the board."""
     (board,) = run_leaderboards([made("mine", "filter", [0.1, 0.2, 0.15, 0.12, 0.18, 0.11])])
     (cells,) = said(run_table(board, drawn=True)).to_dict("records")
-    assert cells["ẽ_c"] == with_interval(*board.rows[0].interval("error")) and "(" in cells["ẽ_c"]
+    assert cells["ẽ_c"] == format_interval(*board.rows[0].interval("error")) and "(" in cells["ẽ_c"]
 
 
 def test_terminal_tables_fit_and_name_what_is_left_out():

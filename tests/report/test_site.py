@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from eitbench._files import PACKAGE
 from eitbench.bench.records import read_records
-from eitbench.bench.table import NOTHING
-from eitbench.bench.text import number, with_interval
+from eitbench.bench.table import MISSING
+from eitbench.bench.text import format_interval, format_number
 from eitbench.bench.tracks import ids
 from eitbench.report import charts
 from eitbench.report.site import (
@@ -113,13 +113,13 @@ def test_numbers_are_those_of_the_boards(pages):
             assert len(cells_of_rows) == len(board.rows)
             for cells, row in zip(cells_of_rows, board.rows, strict=True):
                 rank = row.cells["rank"]
-                assert cells[0].split()[0] == (NOTHING if rank is None else str(rank))
+                assert cells[0].split()[0] == (MISSING if rank is None else str(rank))
                 assert all(word in cells[1] for word in [row.cells["title"], row.label, *row.badges])
                 assert ("self-reported" in cells[1]) != row.cells["official"]
                 for name in ("error", "gain"):
                     if row.cells[name] is not None:
-                        assert with_interval(*row.interval(name)) in " ".join(cells)
-                assert board.is_aggregate or number(row.cells["seconds_per_step"]) in cells
+                        assert format_interval(*row.interval(name)) in " ".join(cells)
+                assert board.is_aggregate or format_number(row.cells["seconds_per_step"]) in cells
     ranks = [cells[0] for cells in rows_of(pages["environments/eitbench-Pipe2D-v0.html"], "<h2>Leaderboard</h2>")]
     assert [rank for rank in ranks if rank.startswith("1")] == ["1 shared", "1 shared"]
 
@@ -129,7 +129,7 @@ def test_a_methods_page_has_every_episode_and_its_provenance(pages):
     html = pages["methods/failing.html"]
     assert all(f">test:{i}</td>" in html for i in range(8)) and "RuntimeError: oh" in html and "1 failed" in html
     for episode in next(r for r in several_boards() if r["method"] == "failing")["episodes"][:7]:
-        assert f">{number(episode['scores']['error'])}</td>" in html
+        assert f">{format_number(episode['scores']['error'])}</td>" in html
     text = text_of(pages["methods/b.html"])
     for expected in ("window = 3", "numpy 2.4.6", "An abacus", "c0ffee", "eitbench run",
                      "eitbench verify leaderboards/results/eitbench-Pipe2D-v0--b--"):
@@ -205,8 +205,8 @@ def test_the_line_of_an_agent_is_the_mean_of_its_trainings():
         assert row.cells[end] == pytest.approx(same.cells[end])
     ranks = sorted(part.cells["rank"] for part in parts[:3])
     first = page_table(board, "").rows[0]
-    assert first.cells[0].text == f"{ranks[0]}–{ranks[-1]}" and first.cells[1].small == "mean of 4 trainings"
-    assert "each 0.110 to 0.131" in first.cells[2].small and len(first.parts) == 4
+    assert first.cells[0].text == f"{ranks[0]}–{ranks[-1]}" and first.cells[1].note == "mean of 4 trainings"
+    assert "each 0.110 to 0.131" in first.cells[2].note and len(first.children) == 4
     assert len(markdown_table(board).rows) == len(board.rows)
 
 
@@ -259,7 +259,7 @@ def test_robustness_by_hand():
     assert list(shown.loc["other"]) == ["0.1", "0.08 × 0.8", "0.02 × 0.2", "0.55", "0.2 short slugs"]
     assert list(shown.index[:4]) == ["steady", "other", "homogeneous", "tuned"]
     assert [cell for cell in shown.to_numpy().ravel() if "below" in cell] == ["0.3 × 15 (below the floor)"]
-    assert list(shown.loc["bad"]) == [NOTHING, "0.1 (3 failed)", NOTHING, NOTHING, NOTHING]
+    assert list(shown.loc["bad"]) == [MISSING, "0.1 (3 failed)", MISSING, MISSING, MISSING]
     better = robustness([*shifted()[:-1], record("persistence", [0.11] * 4, id=NOISE, version="v1", **FLOOR),
                          record("mine", [1e-9] * 4, id=NOISE, role="floor")])     # a self-reported floor marks nothing
     assert set(better[better["double noise"].str.contains("below")].index) == {"tuned", "steady"}

@@ -12,7 +12,7 @@ from eitbench.envs.injection import InjectionVectorEnv
 from eitbench.estimation.onboard.rules import Rules
 from eitbench.rl import training
 from eitbench.rl.agents import configuration_hash, load_agent
-from eitbench.rl.training import ALGORITHMS, Config, read_config, train
+from eitbench.rl.training import ALGORITHMS, TrainingConfig, read_config, train
 from eitbench.rl.vec_env import InjectionVecEnv
 from eitbench.worlds.catalogue import PIPE_2D
 from threadpoolctl import threadpool_limits
@@ -24,7 +24,7 @@ NAME = "eitbench/Pipe2DInjection-v0"
 CURRENTS, BUDGET = "eitbench/Pipe2DInjectionCurrents-v0", "eitbench/Pipe2DInjectionBudget-v0"
 SHORT = {"world": {"flow": {"mean_velocity": 16.0}, "schedule": {"scored_steps": 4}}}
 """Four steps of the agent an episode."""
-TINY = Config(total_steps=32, n_envs=2, interval=16, evaluation_episodes=2, episodes=3, hidden=(8,),
+TINY = TrainingConfig(total_steps=32, n_envs=2, interval=16, evaluation_episodes=2, episodes=3, hidden=(8,),
               algorithm={"n_steps": 8, "batch_size": 8})
 RUNS = {"ppo": (NAME, {"n_steps": 8, "batch_size": 8}), "maskable_ppo": (BUDGET, {"n_steps": 8, "batch_size": 8}),
         "recurrent_ppo": (NAME, {"n_steps": 8, "batch_size": 8}),
@@ -81,7 +81,7 @@ def test_every_algorithm_leaves_a_whole_run(run):
     assert 32 <= model.num_timesteps < 48
     kept = np.load(folder / "evaluations.npz")
     assert kept["steps"][0] == 0 and (np.diff(kept["steps"]) > 0).all() and kept["steps"][-1] == model.num_timesteps
-    np.testing.assert_allclose(kept["errors"][-1], training.evaluation(env, kwargs, config)(model), rtol=1e-6)
+    np.testing.assert_allclose(kept["errors"][-1], training.make_evaluator(env, kwargs, config)(model), rtol=1e-6)
     assert json.loads((folder / "config.json").read_text())["algo"] == algo
     assert not (getattr(model.policy, "actor", None) or model.policy).optimizer.state
     assert len((folder / "sha256").read_text()) == 64 and not (folder / "latest.zip").exists()
@@ -171,7 +171,7 @@ def test_an_estimate_that_is_not_finite_shows(monkeypatch):
 
     errors, factors = InjectionVectorEnv.errors, iter([[1, 1], [1, 1], [1, 1], [1, np.nan]])
     monkeypatch.setattr(InjectionVectorEnv, "errors", lambda self: errors(self) * next(factors))
-    assert list(np.isnan(training.evaluation(NAME, SHORT, TINY)(Still()))) == [False, True]
+    assert list(np.isnan(training.make_evaluator(NAME, SHORT, TINY)(Still()))) == [False, True]
 
 
 def test_a_pupil_learns_what_its_teacher_does(tmp_path):
@@ -221,7 +221,7 @@ def test_wrong_arguments_are_named_before_the_folder_is_taken(env, algo, change,
 def test_rewards_of_a_reference_are_subtracted(tmp_path):
     """Rewards of a policy in the same episodes, step by step, in this episode and the next."""
     world = gym.make(NAME, episodes=5, observation="raw", **SHORT).unwrapped
-    reference = training.rewards_of("best_pair", world, tmp_path / "reference.npy")
+    reference = training.policy_rewards("best_pair", world, tmp_path / "reference.npy")
     envs, plain = vector(5), vector(5)
     ours = InjectionVecEnv(envs, reward_scale=10.0, reference=reference)
     ours.seed(5)
@@ -236,4 +236,4 @@ def test_rewards_of_a_reference_are_subtracted(tmp_path):
         expected = 10.0 * np.subtract(*earned)
         assert np.abs(expected).max() > 1e-3
         np.testing.assert_allclose([ours.step(action)[1] for action in actions], expected, atol=1e-6)
-    np.testing.assert_array_equal(training.rewards_of("random_pair", world, tmp_path / "reference.npy"), reference)
+    np.testing.assert_array_equal(training.policy_rewards("random_pair", world, tmp_path / "reference.npy"), reference)

@@ -11,7 +11,7 @@ import pytest
 from eitbench.bench.run import Job, run_episode
 from eitbench.bench.tracks import Environment
 from eitbench.data.seeds import parse_seeds
-from eitbench.scoring import deficit_centre
+from eitbench.scoring import deficit_centroid
 from eitbench.worlds.random_streams import episode_streams
 
 SEED = parse_seeds("dev:0")[0]
@@ -121,7 +121,7 @@ def test_disc_is_tracked_with_one_pair_of_electrodes():
 
     def distance(baseline):
         means = run("RotatingTank2D", baseline)[1]["mean"]
-        errors = np.array([deficit_centre(mean, points, weights) for mean in means]) - path
+        errors = np.array([deficit_centroid(mean, points, weights) for mean in means]) - path
         return np.median(np.hypot(*errors[world.warm_up:].T))
 
     assert distance("kalman_filter") < disc.radius

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from scipy.linalg import toeplitz
 
-from eitbench._notice import say
+from eitbench._notice import notify
 from eitbench.data.seeds import SPLITS
 from eitbench.estimation.inflow_prior import InflowPrior, fit_prior_from_episodes
 from eitbench.estimation.inflow_response import ImpulseResponse
@@ -84,7 +84,7 @@ def inflow_model(response: ImpulseResponse, prior: InflowPrior) -> InflowModel:
 @lru_cache(maxsize=4)
 def fit_world_prior(world: World) -> InflowPrior:
     """Return the prior that training inflows of a world suggest."""
-    say(f"learning the inflow prior of {world.name}, some seconds once a process")
+    notify(f"learning the inflow prior of {world.name}, some seconds once a process")
     longer = replace(world, schedule=replace(world.schedule, scored_steps=N_PRIOR_STEPS))
     return fit_prior_from_episodes(longer, SPLITS["train"][:N_PRIOR_EPISODES])
 

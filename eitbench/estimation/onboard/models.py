@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from eitbench._notice import say
+from eitbench._notice import notify
 from eitbench.data.cache import Key, cached, config_dict, model_key
 from eitbench.estimation.covariance import LowRankCovariance, OpenLoopCovariance
 from eitbench.estimation.filter import Filter
@@ -118,7 +118,7 @@ def load_or_build_model(world: World) -> ReducedModel | JointModel:
     key = reduced_model_key(world)
 
     def build() -> dict[str, np.ndarray]:
-        say(f"making the reduced filter of {world.name}, about half a minute; it is kept in "
+        notify(f"making the reduced filter of {world.name}, about half a minute; it is kept in "
             f"{key.path.parent}")
         return build_packed_model(world)
 

@@ -17,13 +17,13 @@ from typing import Any, NamedTuple
 
 from markupsafe import Markup
 
-from eitbench._files import PACKAGE, replace_folder, shipped
-from eitbench._foreign import as_cell, as_markdown
+from eitbench._files import PACKAGE, bundled_path, replace_folder
+from eitbench._sanitize import escape_csv, escape_markdown
 from eitbench.bench.methods import baseline_folder, builtin_files, builtin_sha256, version_of
 from eitbench.bench.records import finished_at, group_runs, record_file_name, split_outdated
-from eitbench.bench.table import NOTHING, Cell, Table, number_cell
+from eitbench.bench.table import MISSING, Cell, Table, number_cell
 from eitbench.bench.text import scores_by_seed
-from eitbench.bench.tracks import home_of, named
+from eitbench.bench.tracks import environment_name, nominal_id
 from eitbench.envs.env_docs import describe_environment
 from eitbench.report import tables
 from eitbench.report.boards import (
@@ -146,16 +146,17 @@ def render(site: Site) -> dict[str, str]:
         parts.append(f"## {name}")
         for board in boards:
             seeds = f", {board.seeds}" if board.seeds else ""
-            parts += [f"### {as_markdown(board.title)}{seeds}",
+            parts += [f"### {escape_markdown(board.title)}{seeds}",
                       tables.markdown_table(board).markdown()]
     parts += [*robustness.markdown_section(site.boards), *measured.markdown_section(site.measured)]
     if site.boards:
         parts += ["## Column descriptions", markdown_list(column_descriptions())]
     if outdated := split_outdated(site.records)[1]:
         parts += ["## Superseded records", "Made by an earlier version of the method.\n\n"
-                  + "\n".join(f"- {as_markdown(record_file_name(record))}" for record in outdated)]
+                  + "\n".join(f"- {escape_markdown(record_file_name(record))}"
+                              for record in outdated)]
     table = leaderboard_table(site.boards)
-    texts = {name: table[name].map(as_cell) for name in ("environment", "method", "title")}
+    texts = {name: table[name].map(escape_csv) for name in ("environment", "method", "title")}
     plain = table.assign(**texts).to_csv(index=False, float_format="%.6g", lineterminator="\n")
     return {"leaderboard.csv": plain, "leaderboard.md": "\n\n".join(parts) + "\n"}
 
@@ -280,7 +281,8 @@ def environment_page(site: Site, board: Leaderboard) -> bytes:
         front=tables.cost_chart(board), curves=tables.curve_chart(board),
         moving=site.picture(animation, "../"),
         media_mb=f"{1e-6 * site.media.get(animation, 0):.1f} MB",
-        robustness=ROBUSTNESS_PAGE if home_of(id) and named(id, {}) == board.environment else "",
+        robustness=(ROBUSTNESS_PAGE
+                    if nominal_id(id) and environment_name(id, {}) == board.environment else ""),
         siblings=[other for other in site.classes[board.category]
                   if other is not board and not other.is_aggregate])
 
@@ -322,9 +324,9 @@ def _placements(placements: list[tuple[Leaderboard, MethodRow]]) -> tuple[Table,
         link = f"../index.html#{board.anchor}" if board.is_aggregate else f"../{board.address}"
         rows.append({
             "board": Cell(board.title, board.title.casefold(), link=link,
-                          small=f"{board.category} · {row.cells['version']}", badges=row.badges),
-            "rank": Cell(NOTHING) if rank is None else Cell(
-                str(rank), float(rank), small=f"of {sum(each.is_ranked for each in board.rows)}"),
+                          note=f"{board.category} · {row.cells['version']}", badges=row.badges),
+            "rank": Cell(MISSING) if rank is None else Cell(
+                str(rank), float(rank), note=f"of {sum(each.is_ranked for each in board.rows)}"),
             "ẽ_c": tables.ScoreAxes.of(board).cell(row, "error"), "gain": gains.cell(row, "gain"),
             "ms/step": number_cell(row.cells["seconds_per_step"])})
     table = Table.of(rows, label="Boards", keep=list(rows[0]) if rows else ())
@@ -379,7 +381,7 @@ def source_file(record: dict[str, Any]) -> str:
 
 def docstring(record: dict[str, Any], file: str) -> Markup:
     """Return the docstring of the method's file, if this repository holds the recorded version."""
-    path = shipped("baselines").parent / file
+    path = bundled_path("baselines").parent / file
     if path.suffix != ".py" or not _is_version(record, path):
         return Markup()
     return markdown(ast.get_docstring(ast.parse(path.read_bytes())) or "")

@@ -16,8 +16,8 @@ import pandas as pd
 from eitbench.bench.records import finished_at, read_valid_files
 from eitbench.bench.scores import scores
 from eitbench.bench.table import Cell, Table, number_cell
-from eitbench.bench.text import number, scores_by_seed
-from eitbench.bench.tracks import registered
+from eitbench.bench.text import format_number, scores_by_seed
+from eitbench.bench.tracks import registered_kwargs
 from eitbench.measured.cases import MeasuredCase, read_case
 from eitbench.report.templates import markdown_list
 
@@ -49,7 +49,7 @@ class MeasuredBoards(NamedTuple):
         cases: dict[str, MeasuredCase] = {}
         records: dict[str, list[dict[str, Any]]] = {}
         for (id, _), record in sorted(latest.items()):
-            case = read_case(registered(id)["case"])
+            case = read_case(registered_kwargs(id)["case"])
             cases[case.name] = case
             records.setdefault(case.name, []).append(record)
         for own in records.values():
@@ -117,7 +117,7 @@ def _score_cell(record: dict[str, Any], score: str, *, spread: bool = False) -> 
     values = list(scores_by_seed(record, score).values())
     cell = number_cell(fmean(values) if values else None)
     if spread:
-        cell = cell._replace(small=f"{number(min(values))} to {number(max(values))}")
+        cell = cell._replace(note=f"{format_number(min(values))} to {format_number(max(values))}")
     return {scores("measured")[score].heading: cell}
 
 
@@ -125,5 +125,5 @@ def _method_cell(record: dict[str, Any], title: str = "") -> Cell:
     """Name and version with badges, below a title if there is one."""
     badges = [*filter(None, [record["role"]]), *["self-reported"] * (not record["official"])]
     shown = title or _label(record)
-    return Cell(shown, shown.casefold(), small=_label(record) if title else "",
+    return Cell(shown, shown.casefold(), note=_label(record) if title else "",
                 badges=tuple(badges))

@@ -15,9 +15,9 @@ from typing import NamedTuple
 
 from markupsafe import Markup
 
-from eitbench.bench.table import NOTHING, Cell, Table, number_cell
-from eitbench.bench.text import number
-from eitbench.bench.tracks import home_of, ids, named
+from eitbench.bench.table import MISSING, Cell, Table, number_cell
+from eitbench.bench.text import format_number
+from eitbench.bench.tracks import environment_name, ids, nominal_id
 from eitbench.report.boards import Leaderboard, MethodRow, base_environment
 from eitbench.report.tables import author_badges, filter_flags, method_cell
 from eitbench.report.templates import markdown, markdown_list
@@ -76,8 +76,8 @@ class ShiftFamily(NamedTuple):
             cells |= {name: _error_cell(own.get(name), home, floors[name]) for name in self.shifts}
             least = min(gains, key=gains.__getitem__) if gains.keys() == shifted.keys() else ""
             cells["mean gain"] = number_cell(fmean(gains.values()) if least else None)
-            cells["least gain"] = Cell(number(gains[least]), gains[least],
-                                       small=least) if least else Cell(NOTHING)
+            cells["least gain"] = Cell(format_number(gains[least]), gains[least],
+                                       note=least) if least else Cell(MISSING)
             lines.append((-gains[least] if least else math.inf, cells, filter_flags(row)))
         lines.sort(key=lambda line: line[0])
         return Table.of([cells for _, cells, _ in lines], keep=["nominal"],
@@ -90,10 +90,10 @@ def shift_families(boards: Iterable[Leaderboard]) -> list[ShiftFamily]:
     of_environment = {board.environment: board for board in boards if not board.is_aggregate}
     found: dict[str, ShiftFamily] = {}
     for id in ids():
-        home = home_of(id)
-        board = of_environment.get(named(id, {}))
+        home = nominal_id(id)
+        board = of_environment.get(environment_name(id, {}))
         if home and board:
-            nominal = of_environment.get(named(home, {}))
+            nominal = of_environment.get(environment_name(home, {}))
             family = found.setdefault(home, ShiftFamily(home, nominal, {}))
             family.shifts[shift_heading(id, home)] = board
     return list(found.values())
@@ -116,16 +116,16 @@ def _error_cell(row: MethodRow | None, home: MethodRow | None = None,
                 floor: float = math.inf) -> Cell:
     """Return ẽ_c, its ratio to the nominal one, and marks: worse than the floor, unfinished."""
     if row is None:
-        return Cell(NOTHING)
+        return Cell(MISSING)
     error = row.cells["error"]
     lacks = [word for word in row.badges if "failed" in word or "missing" in word]
     if error is None:
-        return Cell(NOTHING, badges=tuple(lacks))
+        return Cell(MISSING, badges=tuple(lacks))
     below = [WORSE_THAN_NAIVE] if "floor" not in row.badges and error > floor else []
     ratio = ""
     if home and home.complete and row.complete and home.cells["error"]:
-        ratio = f"× {number(error / home.cells['error'])}"
-    return Cell(number(error), error, small=ratio, badges=(*below, *lacks))
+        ratio = f"× {format_number(error / home.cells['error'])}"
+    return Cell(format_number(error), error, note=ratio, badges=(*below, *lacks))
 
 
 def markdown_section(boards: Iterable[Leaderboard]) -> list[str]:

@@ -12,7 +12,7 @@ from eitbench.estimation import CalibrationFrame, LinearisedForwardModel, nodal_
 class Estimator:
     """Linearised Kalman filter with clipped estimates."""
 
-    boards = ("filter",)
+    subtracks = ("filter",)
 
     def __init__(self, task: Task) -> None:
         self.task = task

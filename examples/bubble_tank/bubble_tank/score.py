@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from eitbench.bench.scores import Outcome, Score, register_score
-from eitbench.scoring import deficit_centre
+from eitbench.scoring import deficit_centroid
 
 
 def mean_distance(outcome: Outcome) -> float | None:
@@ -13,11 +13,11 @@ def mean_distance(outcome: Outcome) -> float | None:
     if outcome.world.name != "BubbleTank":
         return None
     estimated, true = (
-        np.array([deficit_centre(state, outcome.points, outcome.weights) for state in states])
+        np.array([deficit_centroid(state, outcome.points, outcome.weights) for state in states])
         for states in (outcome.mean, outcome.truth))
     return np.linalg.norm(estimated - true, axis=1).mean()
 
 
 register_score(Score(
     "bubble_distance", "distance", "mean distance of the estimated from the true bubble, mm",
-    mean_distance, needs=("mean", "truth"), factor=1e3))
+    mean_distance, requires=("mean", "truth"), factor=1e3))

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from eitbench._files import PACKAGE
 
-FRAMES = 20
+MAX_STACK_FRAMES = 20
 """Innermost stack frames of a traceback that are shown."""
 _LIBRARIES = [PACKAGE, *(Path(sysconfig.get_path(name)).resolve()
                          for name in ("stdlib", "purelib", "platlib"))]
@@ -21,7 +21,7 @@ _MARKDOWN = re.compile(r"[\\`*\[\]<>|~&!]|(?<!\w)_|_(?!\w)|(?<=\w):(?=//)|(?<=ww
 """Characters that can start markup within a line; not the _ of a_name."""
 
 
-def cleaned(text: str, *, lines: bool = False) -> str:
+def sanitize(text: str, *, lines: bool = False) -> str:
     """Escape control characters, and those that change the direction of text, as Python does; with
     ``lines``, keep line ends and tabs."""
     if text.isascii() and text.isprintable():
@@ -31,30 +31,30 @@ def cleaned(text: str, *, lines: bool = False) -> str:
         else each.encode("unicode_escape").decode() for each in text)
 
 
-def as_markdown(text: str) -> str:
+def escape_markdown(text: str) -> str:
     """Escape text for a terminal and for a line of Markdown."""
-    return _MARKDOWN.sub(r"\\\g<0>", cleaned(text))
+    return _MARKDOWN.sub(r"\\\g<0>", sanitize(text))
 
 
-def as_cell(text: str) -> str:
+def escape_csv(text: str) -> str:
     """Escape text in a CSV file that a spreadsheet would read as a formula."""
     return f"'{text}" if text.startswith(("=", "+", "-", "@")) else text
 
 
-def where_of(error: BaseException, own: Path | None = None) -> str:
+def error_location(error: BaseException, own: Path | None = None) -> str:
     """Return name and line of the file where an error occurred: the innermost stack frame of
-    `traceback_of`, or of all if that is empty."""
+    `user_traceback`, or of all if that is empty."""
     last = (_own_frames(error, own) or traceback.extract_tb(error.__traceback__))[-1]
     return f"{Path(last.filename).name}:{last.lineno}"
 
 
-def traceback_of(error: BaseException, own: Path) -> str:
+def user_traceback(error: BaseException, own: Path) -> str:
     """Return the traceback from a method's file ``own`` on, without libraries and folders; empty
     if the error occurred elsewhere."""
     frames = [traceback.FrameSummary(Path(frame.filename).name, frame.lineno, frame.name,
                                      lookup_line=False, line=frame.line or "")
               for frame in _own_frames(error, own)]
-    return "".join(traceback.StackSummary.from_list(frames[-FRAMES:]).format())
+    return "".join(traceback.StackSummary.from_list(frames[-MAX_STACK_FRAMES:]).format())
 
 
 def _own_frames(error: BaseException, own: Path | None) -> list[traceback.FrameSummary]:
