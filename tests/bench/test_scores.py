@@ -117,14 +117,14 @@ def test_only_scores_that_can_be_better_are_compared(name):
     ({"name": "My score"}, "name must be of lower-case"),
     ({"name": "error"}, "has the name or heading of another, error"),
     ({"heading": "CRPS"}, "has the name or heading of another, crps"),
-    ({"better": "more"}, "better must be one of lower, higher"),
-    ({"needs": ("luck",)}, "needs must be among world, .*got 'luck'"),
+    ({"better": "more"}, "direction must be one of lower, higher"),
+    ({"requires": ("luck",)}, "requires must be among world, .*got 'luck'"),
     ({"tracks": ("sprint",)}, "tracks must be among estimation, injection, measured; got 'sprint'"),
     ({"factor": 0.0}, "factor must be")])
 def test_bad_scores_are_refused(changes, message, apart):
     """Before anything is registered."""
     before = list(scores.scores())
-    given = {"name": "mine", "heading": "mine", "explanation": "", "of": lambda outcome: 0.0} | changes
+    given = {"name": "mine", "heading": "mine", "explanation": "", "compute": lambda outcome: 0.0} | changes
     with pytest.raises(ValueError, match=message):
         register_score(Score(**given))
     assert list(scores.scores()) == before

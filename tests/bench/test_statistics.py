@@ -256,7 +256,8 @@ def by_the_definition(scores, unranked, statistic, higher):
     ranked = [name for name in scores if name not in unranked]
     ranks = dict.fromkeys(scores)
     for name in ranked:
-        others = [paired_difference(scores[name], scores[other], statistic=statistic, n_resamples=500) for other in ranked]
+        others = [paired_difference(scores[name], scores[other], statistic=statistic, n_resamples=500)
+                  for other in ranked]
         ranks[name] = 1 + sum(high < 0 if higher else low > 0 for _, low, high in others)
     return ranks
 
@@ -299,7 +300,8 @@ def test_ranks_are_those_of_the_definition(statistic, higher):
     (lambda: stratified_bootstrap({"pipe": np.ones((3, 3))}, interquartile_mean), "scores_by_stratum must hold"),
     (lambda: stratified_bootstrap({"pipe": [1.0, math.nan]}, interquartile_mean), "scores_by_stratum must hold finite"),
     (lambda: stratified_bootstrap({"pipe": NOISE}, np.mean), "statistic must reduce the last axis only"),
-    (lambda: stratified_bootstrap({"pipe": NOISE}, interquartile_mean, n_resamples=0), "n_resamples must be at least 1"),
+    (lambda: stratified_bootstrap({"pipe": NOISE}, interquartile_mean, n_resamples=0),
+     "n_resamples must be at least 1"),
     (lambda: paired_difference({"pipe": seeded(NOISE)}, {"pipe": seeded(NOISE, "dev")}), "a and b must share a seed"),
     (lambda: paired_difference({"pipe": seeded(NOISE)}, {"tank": seeded(NOISE)}), "environments must be the same"),
     (lambda: paired_difference({}, {}), "a and b must hold finite scores"),
