@@ -194,7 +194,7 @@ def test_documented_commands_are_commands():
     (["run", "--baseline", "empty.py"], "empty.py must define a class Estimator with a method update"),
     (["run", "--baseline", "broken.py"], "broken.py"),
     (["run", "--baseline", "mine.py", "--env", "eitbench/Pipe2DSmoothing-v0"],
-     "baseline mine.py plays none of the environments"),
+     "baseline mine.py suits none of the environments"),
     (["leaderboard", "-o", "nothing"], "no results in nothing; make some with `eitbench run`"),
     (["render", "--step", "3"], "out must end in .png with step"),
     (["render", "--baseline", "fixed_interval_smoother"], "plays smoothing, but eitbench/Pipe2D-v0 is a filter"),
