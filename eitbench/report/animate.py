@@ -33,10 +33,10 @@ ANIMATION_SUFFIXES = (".gif", ".webp")
 
 def animate(environment: str, methods: Sequence[str], seed: str, step: int | None, path: Path, *,
             every: int = 1, isolate: str = "auto") -> Path:
-    """Play a baseline, or a policy, on one episode and draw its scored states into ``path``, one in
-    ``every``, or only state ``step``. Of several baselines the estimates are drawn below the truth.
+    """Run estimators or one policy on an episode and draw every ``every``-th scored state, or only
+    state ``step``, into ``path``. Estimates of several methods are drawn below the truth.
 
-    ``ValueError`` if a method cannot play the environment, several are policies, or the path's
+    ``ValueError`` if a method is not compatible with the environment, several are policies, or the path's
     suffix is not .gif or .webp (.png with ``step``).
     """
     suffixes = ANIMATION_SUFFIXES if step is None else (".png",)
@@ -78,14 +78,14 @@ def animate(environment: str, methods: Sequence[str], seed: str, step: int | Non
 
 
 def _env_frames(env: Any, loaded: list[Method], seed: int, at: range) -> Iterator[np.ndarray]:
-    """What the environment draws of one method at these t."""
+    """Yield the environment's images of one method at these t."""
     for t, *_ in run_until(env, loaded[0], seed, at[-1]):
         if t in at:
             yield np.asarray(env.render())
 
 
 def _compared_frames(env: Any, loaded: list[Method], seed: int, at: range) -> Iterator[np.ndarray]:
-    """Truth and the estimates of several baselines at these t."""
+    """Yield images of the truth and several estimates at these t."""
     shown = [(method.title, states_at(env, method, seed, at)) for method in loaded]
     for t in at:
         truth, _, currents = shown[0][1][t]
@@ -95,7 +95,7 @@ def _compared_frames(env: Any, loaded: list[Method], seed: int, at: range) -> It
 
 
 def _palette() -> Image.Image:
-    """The 256 colours of all frames, which keeps them steady: colour maps, greys, electrodes."""
+    """Return the 256 colours of all frames, which keeps them constant: colour maps, greys, electrodes."""
     colours = [colormaps[name](np.linspace(0, 1, n))[:, :3]
                for name, n in ((FIELD_COLORMAP, 120), (STD_COLORMAP, 100))]
     greys = np.linspace(0, 1, 27)[:, None].repeat(3, axis=1)

@@ -1,6 +1,6 @@
-"""Leaderboards from records: columns, scores, intervals, gains, skills and ranks.
+"""Leaderboards from records: columns, scores, intervals, skill scores and ranks.
 
-A board is a list of rows, and the cells of all rows are one tidy table (`leaderboard_table`).
+A leaderboard is a list of rows; `leaderboard_table` returns the cells of all rows as one frame.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ IDENTITY_FIELDS = ("class", "environment", "method", "version", "title", "rank",
 INTERVAL_SCORES = ("error", "gain")
 """Numbers with an interval."""
 SKILL_ANCHORS = ("homogeneous", "true_model_smoother")
-"""Methods with skills 0 and 1."""
+"""Methods with normalised scores 0 and 1."""
 Anchors = Mapping[tuple[str, str, str], Mapping[str, float]]
 """Method, world, split -> seed -> ẽ_c."""
 SPLIT_ORDER = ("test", "dev", "train", "own")
@@ -62,32 +62,36 @@ _NON_WORLD_KWARGS = ("lag", "assume", "gate", "inflow", "episodes", "render_mode
                   "estimator")
 """Arguments of an environment that leave its true episodes unchanged."""
 _SKILL_SCORE = (
-    "gain", "1 − ẽ_c / ẽ_c of the floor (homogeneous; random_pair) in the same episode: 0 as the "
-    "floor, 1 perfect. Interquartile mean with its 95 % bootstrap interval")
-_NORMALISED_SCORE = ("skill", "(E_h − E) / (E_h − E_s): 0 for the homogeneous estimate, 1 for the "
-          "fixed-interval smoother with the true flow, both from the whole record where the "
-          "environment has such a board, so that filters may fall below 0. With †, where these two "
-          "have no record of the same episodes: 1 − contrast")
+    "skill score", "1 − ẽ_c / ẽ_c of the naive baseline (homogeneous; random_pair) in the same "
+    "episode, dimensionless: 0 equals the baseline, 1 is a perfect estimate. Interquartile mean "
+    "over the episodes with its 95 % bootstrap interval; higher is better")
+_NORMALISED_SCORE = (
+    "normalised score", "(E_h − E) / (E_h − E_s) with the mean errors E of the method, E_h of the "
+    "homogeneous estimate and E_s of the fixed-interval smoother with the true flow, "
+    "dimensionless: 0 equals the homogeneous estimate, 1 the smoother. E_h and E_s are taken from "
+    "the smoothing leaderboard where there is one, so that filters can be below 0. †: 1 − contrast "
+    "error, where these two methods have no record of the same episodes")
 COST_COLUMNS = {
     "matmuls_per_step": (
-        "products/step", "time per step in units of a 1000 × 1000 × 1000 matrix product on one "
-        "thread of that processor, the median of all that were timed on it"),
-    "peak_memory": ("MB", "peak memory of the method's process"),
+        "matmul units/step", "computing time per step divided by the time of a 1000 × 1000 × 1000 "
+        "matrix product on one thread of the same processor (median of all timings); "
+        "dimensionless"),
+    "peak_memory": ("peak memory (MB)", "peak memory of the method's process, 10⁶ bytes"),
 }
-_RANK = ("1 + the number of methods that are significantly better; shared where the difference is "
-         "not significant. Floors, references, privileged methods and those that have not finished "
-         "every episode have none")
+_RANK = ("1 + the number of methods that are significantly better (paired bootstrap, 95 %); methods "
+         "without a significant difference are tied. Naive baselines, oracles, privileged methods "
+         "and methods with missing or failed episodes are not ranked")
 
 
 class MethodRow(NamedTuple):
     """One method on a board."""
 
     cells: dict[str, Any]
-    """Values of `csv_fields`; None where there is no value."""
+    """Values of `csv_fields`; None if missing."""
     record: dict[str, Any] | None = None
     """Restricted to the board's episodes; None in an aggregate."""
     skill_scores: dict[str, float] = {}  # noqa: RUF012 (never changed)
-    """Seed -> gain over the floor; empty without a floor."""
+    """Seed -> skill score; empty without a naive baseline."""
     colour: int = 0
 
     @property
@@ -97,7 +101,7 @@ class MethodRow(NamedTuple):
 
     @property
     def is_ranked(self) -> bool:
-        """Whether it has a rank."""
+        """True if the method has a rank."""
         return self.cells["rank"] is not None
 
     @property
@@ -107,12 +111,12 @@ class MethodRow(NamedTuple):
 
     @property
     def unranked(self) -> bool:
-        """Whether it is a floor, a reference or privileged, finished or not."""
+        """True for a naive baseline, an oracle or a privileged method."""
         return not {"floor", "reference", "privileged"}.isdisjoint(self.badges)
 
     @property
     def complete(self) -> bool:
-        """Whether it has finished every episode."""
+        """True if the method has finished every episode."""
         return not re.search("failed|missing", self.cells["note"])
 
     def interval(self, name: str) -> tuple[float, float, float]:
@@ -161,8 +165,8 @@ class Leaderboard(NamedTuple):
 
 
 def columns(*, measured: bool = True) -> dict[str, tuple[str, str]]:
-    """Return name -> heading and explanation of each number: registered scores, gain, skill and
-    costs; with ``measured`` also the scores of measurements."""
+    """Return name -> heading and explanation of each number: registered scores, skill score,
+    normalised score and costs; with ``measured`` also the scores of measurements."""
     known = scores() | (scores("measured") if measured else {})
     each = {name: (score.heading, score.explanation) for name, score in known.items()}
     heading, text = each.pop("error")
@@ -245,10 +249,10 @@ def _arguments(kwargs: dict[str, Any]) -> str:
 def leaderboards(records: list[dict[str, Any]]) -> list[Leaderboard]:
     """Return a board for each environment, class by class, each class followed by its aggregate.
 
-    The episodes of a board are those that its floor has played; without a floor, all. Superseded
-    records are left out. An aggregate, with ``environment`` `ALL`, is of the methods that have
-    finished every episode of all `aggregate_environments` with a floor, if there are several (with
-    an official floor, where there is any). ``seconds_per_step`` is in ms of the fastest
+    A leaderboard has the episodes of its naive baseline, or all if it has no baseline. Superseded
+    records are left out. An aggregate, with ``environment`` `ALL`, holds the methods that have
+    finished every episode of all `aggregate_environments` with a naive baseline (an official one
+    where it exists), if there are several. ``seconds_per_step`` is in ms of the fastest
     episode, ``voltage_discrepancy`` in mV², ``peak_memory`` in 10⁶ bytes.
 
     Raises
@@ -279,7 +283,7 @@ def run_leaderboards(records: list[dict[str, Any]], known: Anchors | None = None
     records : list
         Of any splits and versions; all of their episodes are shown.
     known : Anchors
-        Between which skills are measured; default: those among the records.
+        Errors that define normalised scores 0 and 1; default: from these records.
     """
     known = anchors(records) if known is None else known
     return _boards(sorted(records, key=_split_order), records, known, ranked=False)
@@ -360,13 +364,13 @@ def _sort_key(row: MethodRow) -> tuple[bool, float, str]:
 
 
 def naive_baseline_record(records: Iterable[dict[str, Any]]) -> dict[str, Any] | None:
-    """Return the record from which gains are counted, of those of one environment, if any."""
+    """Return the naive baseline among the records of one environment, if any; official first."""
     return max(filter(is_naive_baseline, records), default=None,
                key=lambda record: (record["official"], finished_at(record)))
 
 
 def is_naive_baseline(record: dict[str, Any]) -> bool:
-    """Return whether it is a record of the built-in floor: third-party versions are no numbers."""
+    """Return True for a record of the built-in naive baseline (its version is a number)."""
     return (record["method"] == NAIVE_BASELINES[track_of_subtrack(record["board"])]
             and version_number(record["version"]) is not None)
 
@@ -377,12 +381,12 @@ def episode_errors(record: dict[str, Any] | None) -> dict[str, float]:
 
 
 def skill_scores(zero: dict[str, float], errors: dict[str, float]) -> dict[str, float]:
-    """Return seed -> gain over the errors ``zero`` of the floor, of the shared seeds."""
+    """Return seed -> skill score relative to the errors ``zero`` of the naive baseline."""
     return {seed: 1.0 - error / zero[seed] for seed, error in errors.items() if zero.get(seed)}
 
 
 def error_and_skill(errors: dict[str, float], zero: dict[str, float]) -> dict[str, float | None]:
-    """Return mean error and interquartile mean gain of one environment, with their intervals."""
+    """Return mean error and interquartile mean skill score of one environment, with intervals."""
     return (_with_interval("error", {"": errors}, mean_over_environments)
             | _with_interval("gain", {"": skill_scores(zero, errors)}, interquartile_mean))
 
@@ -404,13 +408,13 @@ def _with_interval(name: str, values: dict[str, dict[str, float]],
 
 def aggregate_environments() -> set[str]:
     """Return the names of the environments of aggregates: all registered ids with their default
-    arguments, without shifts, which have a board of their own."""
+    arguments, without shifted environments, which have a separate leaderboard."""
     return {environment_name(id, {}) for id in ids() if not nominal_id(id)}
 
 
 def _aggregate_boards(made: list[Leaderboard]) -> list[Leaderboard]:
-    """Return the boards of an aggregate: with a floor; with an official floor where there is any,
-    otherwise a third-party floor could exclude all other methods."""
+    """Return the leaderboards of an aggregate: with a naive baseline, an official one where
+    it exists, since a third-party baseline could exclude all other methods."""
     names = aggregate_environments()
     own = [board for board in made if board.environment in names
            and any(row.skill_scores for row in board.rows)]
@@ -420,7 +424,7 @@ def _aggregate_boards(made: list[Leaderboard]) -> list[Leaderboard]:
 
 def _aggregate(category: str, made: list[Leaderboard]) -> list[Leaderboard]:
     """Return the methods that have finished all of several environments, ordered and ranked by the
-    interquartile mean of their gains."""
+    interquartile mean of their skill scores."""
     if len(made) < 2:
         return []
     found = [{row.label: row for row in board.rows if row.complete and row.skill_scores}
@@ -449,13 +453,12 @@ def _aggregate(category: str, made: list[Leaderboard]) -> list[Leaderboard]:
 
 
 def read_leaderboard_records(folder: Path) -> tuple[list[dict[str, Any]], list[str]]:
-    """Return the records of a folder that boards show, and one sentence for each record that no
-    board can show.
+    """Return the records of a folder that boards show, and one message for each invalid record.
 
     Raises
     ------
     ValueError
-        If there is no such folder, or it has no such record.
+        If the folder does not exist or holds no valid record of test seeds.
     """
     if not folder.is_dir():
         raise ValueError(f"records must be a folder that exists, got {folder}")
@@ -465,7 +468,7 @@ def read_leaderboard_records(folder: Path) -> tuple[list[dict[str, Any]], list[s
     found = [record for record in read.values() if record["split"] == "test"]
     if not found:
         raise ValueError("; ".join([f"records must be a folder with records of test seeds, got "
-                                    f"{folder}, where there are none that can be shown",
+                                    f"{folder}, which holds no valid record of test seeds",
                                     *complaints]))
     return found, complaints
 
@@ -474,11 +477,11 @@ def read_leaderboard_records(folder: Path) -> tuple[list[dict[str, Any]], list[s
 
 
 def anchors(records: Iterable[dict[str, Any]]) -> Anchors:
-    """Return the errors between which skills are measured: for each world and split those of the
-    board with the most data for each estimate, official where possible."""
+    """Return the errors that define normalised scores 0 and 1: for each world and split from the
+    leaderboard with the most data for each estimate, official where possible."""
     found: dict[tuple[str, str, str], dict[str, Any]] = {}
     for record in records:
-        # a third-party method of that name is no anchor
+        # a third-party method with this name does not count
         if record["method"] in SKILL_ANCHORS and version_number(record.get("version", "v1")):
             key = (record["method"], world_key(record), record["split"])
             found[key] = max(found.get(key, record), record, key=lambda other: (

@@ -40,14 +40,14 @@ class Series(NamedTuple):
 
 
 class ParetoPoint(NamedTuple):
-    """One mark of a `pareto_chart`."""
+    """Mark of a `pareto_chart`."""
 
     name: str
     colour: int
     x: float
     y: float
     is_ranked: bool = True
-    """Whether it may be on the front."""
+    """True if the point may be on the Pareto front."""
 
 
 class Chart(NamedTuple):
@@ -108,7 +108,7 @@ def line_chart(x: np.ndarray, series: Sequence[Series], x_label: str, y_label: s
 
 def pareto_chart(points: Sequence[ParetoPoint], x_label: str, y_label: str) -> Markup:
     """Draw marks over two logarithmic axes, where small is good; `pareto_front` ones are filled and
-    joined. Names stand beside their marks where there is room."""
+    joined. Names are written next to their marks where they fit."""
     def axis(values: list[float], begin: float, end: float) -> Axis:
         positive = [value for value in values if value > 0] or [1.0]  # a zero is at the edge
         return Axis(min(positive) / 1.4, max(positive) * 1.4, begin, end, log=True)
@@ -151,8 +151,8 @@ def legend(series: Iterable[Series | ParetoPoint]) -> list[tuple[int, bool, str]
 def sparkline(three: tuple[float, float, float], px: Axis, *, mark: float | None = None,
          each: Iterable[float] = ()) -> Markup:
     """Draw a dot and its interval for a table's cell, on the axis of its column, with a line at
-    ``mark`` and a stroke for ``each`` value of a mean. Hidden from screen readers: the number
-    beside it says the same."""
+    ``mark`` and a stroke for ``each`` value of a mean. Hidden from screen readers: the adjacent
+    number has the same content."""
     value, a, b = (min(end if math.isfinite(end) else three[0], px.high) for end in three)
     strokes = "".join(f"M{px(min(one, px.high)):.1f} 2V12" for one in each)
     return Markup(f'<svg class="cell" viewBox="0 0 {CELL_WIDTH_PX} 14" aria-hidden="true">'
@@ -175,7 +175,7 @@ def sparkline_axis(px: Axis, *, mark: float | None = None) -> Markup:
 
 
 def truncate(name: str, letters: int) -> str:
-    """Return a name of so many characters at most."""
+    """Return a name of at most ``letters`` characters."""
     return name if len(name) <= letters else f"{name[:letters - 1].rstrip()}…"
 
 
@@ -234,7 +234,7 @@ def _format_tick(tick: float) -> str:
 
 def _free_position(x: float, y: float, width: float, taken: list[tuple[float, float, float, float]]
           ) -> tuple[float, float, str] | None:
-    """Return where a name of this width fits beside (x, y) clear of ``taken``, to which it is
+    """Return where a name of this width fits next to (x, y) without overlapping ``taken``, to which it is
     added."""
     for dx, dy, anchor in ((10, 4, "start"), (-10, 4, "end"), (6, -9, "start"), (6, 18, "start"),
                            (-6, -9, "end"), (-6, 18, "end")):

@@ -1,4 +1,4 @@
-"""Two methods seed by seed: differences, their intervals, and how often one is better."""
+"""Paired comparison of two methods: differences, intervals, fraction of episodes won."""
 
 from __future__ import annotations
 
@@ -33,24 +33,23 @@ from eitbench.report.boards import is_naive_baseline, record_category, skill_sco
 
 COMPARISON_FIELDS = ("environment", "score", "episodes", "a", "b", "difference", "low", "high",
           "better", "better_low", "better_high")
-SKILL_SCORE = "gain"
-"""Score over several environments instead of the error, whose mean the largest would dominate: 1 −
-ẽ_c over that of the floor in the same episode, as on the boards."""
+SKILL_SCORE = "skill score"
+"""Score over several environments instead of the error, whose mean the largest error dominates."""
 BUNDLED_RECORDS = bundled_path("leaderboards") / "results"
 """Records of the package."""
 MIN_VERSION_PREFIX = 4
-"""Least number of first digits of a sha256 that name a version."""
+"""Smallest number of leading sha256 digits that identify a version."""
 
 
 def find_records(name: str, folder: Path) -> list[dict[str, Any]]:
     """Return the records of a method from the path of one, or from METHOD or METHOD@VERSION within
-    a folder, otherwise among those of the package. Without a version the newest, official ones
+    a folder, otherwise among the bundled records. Without a version the newest, official ones
     where there are any; a third-party version may be shortened to four digits.
 
     Raises
     ------
     ValueError
-        If there is none, or a name without version fits several versions.
+        If no record matches, or a name without version fits several versions.
     """
     if name.endswith(".json"):
         return [read_record(resolve_input(Path(name)))]
@@ -74,7 +73,7 @@ def find_records(name: str, folder: Path) -> list[dict[str, Any]]:
             raise ValueError(f"{name} fits several versions: {found}")
         if own:
             return own
-    raise ValueError(f"there is no record of {name} in {folder}"
+    raise ValueError(f"record of {name} not found in {folder}"
                      + _check.did_you_mean(method, known))
 
 
@@ -88,8 +87,7 @@ def resolve_score(name: str) -> Score:
 
 
 def naive_baseline_records(folder: Path) -> list[dict[str, Any]]:
-    """Return the records from which gains are counted: of the package, and of a folder, which
-    precede."""
+    """Return the records of naive baselines: bundled ones, and from a folder, which precede."""
     folders = dict.fromkeys([BUNDLED_RECORDS.resolve(), folder.resolve()])
     return split_outdated([record for each in folders for record in read_records(each)
                    if is_naive_baseline(record)])[0]
@@ -100,8 +98,9 @@ def compare(a: list[dict[str, Any]], b: list[dict[str, Any]], score: str = "erro
     """Compare a score of a and b on the episodes that both finished: a row for each environment,
     and rows for several of them together.
 
-    For the error, the latter compare gains: a row for each class with several environments that
-    have a floor among ``zero``, ``all filter`` and so on. For other scores it is one row, ``all``.
+    For the error, the aggregate rows compare skill scores: ``all filter`` and so on, for each
+    category with several environments that have a baseline among ``zero``. For other scores there
+    is one row, ``all``.
 
     Returns
     -------
@@ -114,7 +113,7 @@ def compare(a: list[dict[str, Any]], b: list[dict[str, Any]], score: str = "erro
     Raises
     ------
     ValueError
-        If there is no such score, or no environment in which both have it in an episode.
+        If the score is unknown, or the methods share no finished episode with this score.
     """
     higher = resolve_score(score).direction == "higher"
     theirs = {_environment_and_split(record): scores_by_seed(record, score) for record in b}
@@ -134,9 +133,8 @@ def compare(a: list[dict[str, Any]], b: list[dict[str, Any]], score: str = "erro
             if gained := skill_scores(level, own):
                 gains[record_category(record)][label] = gained, skill_scores(level, other)
     if not both:
-        also = f" and have {score}" if score != "error" else ""
-        raise ValueError("there is no environment in which both have finished an episode of the "
-                         f"same seed{also}")
+        also = f" with {score}" if score != "error" else ""
+        raise ValueError(f"methods must share an environment and a seed that both finished{also}")
     rows = [_row(label, score, {label: pair}, mean_over_environments, higher=higher)
             for label, pair in both.items()]
     if score == "error":
@@ -169,8 +167,8 @@ def display_names(a: dict[str, Any], b: dict[str, Any]) -> tuple[str, str]:
 
 
 def comparison_table(table: pd.DataFrame, a: str, b: str, score: str = "error") -> Table:
-    """Return the comparison of methods named ``a`` and ``b``, with a verdict: the better one where
-    the interval of the difference excludes zero."""
+    """Return the comparison of methods named ``a`` and ``b``, with the better one where the
+    95 % interval of the difference excludes zero."""
     asked = resolve_score(score)
     rows = []
     for row in table.to_dict("records"):
@@ -187,7 +185,7 @@ def comparison_table(table: pd.DataFrame, a: str, b: str, score: str = "error") 
                       for key, cell in levels.items()}
         rows.append({
             "environment": row["environment"].removeprefix("eitbench-"),
-            "verdict": less if row["high"] < 0 else more if row["low"] > 0 else MISSING,
+            "better": less if row["high"] < 0 else more if row["low"] > 0 else MISSING,
             "episodes": Cell(str(row["episodes"]), float(row["episodes"])), **levels,
             "difference": Cell(three, row["difference"]),
             f"{a} better": Cell(share, row["better"])})
@@ -197,7 +195,7 @@ def comparison_table(table: pd.DataFrame, a: str, b: str, score: str = "error") 
 def format_comparison(table: pd.DataFrame, a: str, b: str, score: str, width: int) -> str:
     """Return the comparison in lines of ``width`` characters, where the methods are A and B."""
     whole = comparison_table(table, "A", "B", score)
-    first = ("environment", "verdict", "difference", *whole.headings[3:5], "A better", "episodes")
+    first = ("environment", "better", "difference", *whole.headings[3:5], "A better", "episodes")
     fitted = whole.fit_width(width, first)
     return "\n\n".join([f"A: {a}\nB: {b}", fitted.markdown(),
                         *filter(None, [whole.omitted_columns(fitted)])])

@@ -1,4 +1,4 @@
-"""Records of a run: those that were asked for, and the episodes that a method did not finish."""
+"""Records of a run: requested episodes, and episodes that a method did not finish."""
 
 from __future__ import annotations
 

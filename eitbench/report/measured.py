@@ -31,8 +31,8 @@ if TYPE_CHECKING:
 CLASS_COLOURS = ListedColormap(["#f4f4f2", "#d1495b", "#0b6e75"])
 """Water, resistive, conductive."""
 LINE_COLOURS = ("#0b6e75", "#d1495b", "#b8860b", "#7a5195", "#5b6770")
-CORRECTION_TEXT = {"offset": "The misfit is subtracted from all readings.",
-                   "gain": "Each reading is divided by its ratio to the model.",
+CORRECTION_TEXT = {"offset": "The misfit is subtracted from all measurements.",
+                   "gain": "Each measurement is divided by its ratio to the model.",
                    "none": "Nothing is corrected: the image is absolute."}
 MIN_PLOTTED = 1e-2
 """Lower end of the axes of residuals and NIS, which are 0 in a homogeneous first frame."""
@@ -70,11 +70,11 @@ def _facts(env: MeasuredEnv) -> dict[str, str]:
     calibration, measurements, task = env.calibration, env.measurements, env.task
     contacts = 1e3 * calibration.contact_impedance
     facts = {
-        "readings": f"{len(measurements.injection_index)} times {len(measurements.matrix)}, of "
+        "measurements": f"{len(measurements.injection_index)} times {len(measurements.matrix)}, of "
                     f"{len(measurements.currents)} different injections",
         "conductivity": f"{calibration.conductivity:.4g} S/m ± "
                         f"{100 * calibration.conductivity_std:.2g} %",
-        "gain": f"{calibration.gain:.4g}",
+        "channel gain": f"{calibration.gain:.4g}",
         "contact impedances": f"{contacts.min():.3g} to {contacts.max():.3g} mΩ·m²",
         "noise of the instrument" if calibration.noise_from_repeats else "misfit of the model":
             _noise(calibration.noise),
@@ -92,7 +92,7 @@ def _facts(env: MeasuredEnv) -> dict[str, str]:
 
 
 def _noise(noise: Any) -> str:
-    return f"{100 * noise.relative:.2g} % of the reading and {1e3 * noise.floor:.2g} mV"
+    return f"{100 * noise.relative:.2g} % of the measurement and {1e3 * noise.floor:.2g} mV"
 
 
 def _estimate(env: MeasuredEnv, run: MeasuredRun) -> str:
@@ -194,7 +194,7 @@ def _frame_means(values: np.ndarray, frame: int) -> np.ndarray:
 
 
 def _fit(env: MeasuredEnv) -> Figure:
-    """Measured readings of homogeneous fluid over those of the fitted model."""
+    """Draw measurements of homogeneous fluid over the fitted model's voltages."""
     figure, (values, misfit) = _panels(2, (10.5, 3.6))
     known = np.isfinite(env.calibration.mean_voltages)
     measured = 1e3 * env.calibration.mean_voltages[known]
@@ -221,7 +221,7 @@ def _contacts(env: MeasuredEnv) -> Figure:
     misfits = electrode_misfits(calibration, env.measurements.matrix)
     misfits *= 100 / np.nanmean(np.abs(calibration.mean_voltages))
     misfit.bar(number, misfits, color=LINE_COLOURS[1])
-    misfit.set(xlabel="electrode", ylabel="misfit of its readings / %\nof the mean reading")
+    misfit.set(xlabel="electrode", ylabel="misfit of its measurements / %\nof the mean measurement")
     return figure
 
 
@@ -232,7 +232,7 @@ def _electrodes(run: MeasuredRun) -> Figure:
     figure, (axes,) = _panels(1, (10.5, 1.6 + 0.09 * len(number)))
     if len(residuals) == 1:
         axes.bar(number, residuals[0], color=LINE_COLOURS[1])
-        axes.set(xlabel="electrode", ylabel="residual of its readings / noise std")
+        axes.set(xlabel="electrode", ylabel="residual of its measurements / noise std")
         return figure
     shown = np.log10(np.maximum(residuals.T, 1e-3))
     drawn = axes.pcolormesh(run.frame_times, number, shown, cmap="magma", shading="nearest",

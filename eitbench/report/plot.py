@@ -1,4 +1,4 @@
-"""Pictures for one's own scripts and notebooks, as axes of matplotlib: ``eitbench.plot``."""
+"""Figures for scripts and notebooks as matplotlib axes: ``eitbench.plot``."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def field(task: Task, c: Any, ax: Axes | None = None, *, currents: Any = None,
     c : (n,) array or Estimate
         mol/m³ at the nodes of ``task.mesh``; of an estimate the mean.
     ax : Axes, optional
-        Where; default: of a new figure.
+        Axes to draw on; default: axes of a new figure.
     currents : (L,) array, optional
         In A: the electrode where a current enters is red, where it leaves blue.
     colour_bar : bool
@@ -66,21 +66,21 @@ def field(task: Task, c: Any, ax: Axes | None = None, *, currents: Any = None,
 
 def episode(method: Any, env: str | gym.Env, seed: int | str, *,
             world: dict[str, Any] | None = None, times: int = 4) -> np.ndarray:
-    """Play a method on an episode, and draw truth and estimate side by side.
+    """Run a method on an episode, and draw truth and estimate side by side.
 
     Parameters
     ----------
     method, env, world
-        As in `eitbench.evaluate`. Of a policy the estimate is that of the environment's filter.
+        As in `eitbench.evaluate`. For a policy the estimate is the environment's.
     seed : int or str
         The episode, as in ``"dev:0"``.
     times : int
-        How many scored states are drawn, evenly spread over the episode.
+        Number of scored states, uniformly distributed over the episode.
 
     Returns
     -------
     (times, 2) array of Axes
-        Titles say the time and ẽ_c of the estimate.
+        Titles have the time and ẽ_c of the estimate.
 
     Raises
     ------
@@ -93,7 +93,7 @@ def episode(method: Any, env: str | gym.Env, seed: int | str, *,
     number = parse_single_seed(seed)
     made = asked.make()
     if not is_compatible(loaded, made):
-        raise ValueError(f"method {loaded.name} does not play {asked.id}")
+        raise ValueError(f"method {loaded.name} is not compatible with {asked.id}")
     world_of = made.world
     _check.integer("times", times, low=1, high=world_of.schedule.scored_steps)
     wanted = list(map(int, np.linspace(world_of.warm_up + 1, world_of.n_steps, times + 2)[1:-1]))
@@ -125,21 +125,21 @@ def compare(table: pd.DataFrame | Iterable[pd.DataFrame], ax: Axes | None = None
     Parameters
     ----------
     table : DataFrame, or several
-        As `eitbench.evaluate` gives them.
+        As `eitbench.evaluate` returns them.
     ax : Axes, optional
-        Where; default: of a new figure.
+        Axes to draw on; default: axes of a new figure.
     score : str
         A column of the tables.
 
     Raises
     ------
     ValueError
-        If there is no table or no such column, or nobody has the score.
+        If the table or the column is missing, or no method has the score.
     """
     tables = [table] if isinstance(table, pd.DataFrame) else list(table)
     if not tables or not all(isinstance(each, pd.DataFrame) for each in tables):
         kinds = ", ".join(type(each).__name__ for each in tables)
-        raise ValueError("table must be a DataFrame or several, as eitbench.evaluate gives them, "
+        raise ValueError("table must be a DataFrame or several, as eitbench.evaluate returns them, "
                          f"got {kinds or 'none'}")
     rows = pd.concat(tables)
     if score not in rows or score in ("environment", "method", "seed"):
@@ -184,7 +184,7 @@ def logarithmic(ax: Axes, which: Literal["x", "y"]) -> None:
 
 
 def parse_single_seed(seed: int | str) -> int:
-    """Return the number of an episode; ``ValueError`` if it is none or several."""
+    """Return the number of an episode; ``ValueError`` unless ``seed`` names one."""
     if not isinstance(seed, str):
         return _check.integer("seed", seed, low=0)
     numbers = parse_seeds(seed)
@@ -197,7 +197,7 @@ def run_until(env: Any, method: Any, seed: int, last: int) -> Iterator[Any]:
     """Yield what `iter_estimates` or `iter_injections` yields up to the state t = ``last``."""
     steps = iter_injections if isinstance(env, InjectionEnv) else iter_estimates
     states = steps(env, method, seed)
-    for state in tqdm(states, total=last, desc="playing", unit="state", disable=None):
+    for state in tqdm(states, total=last, desc="running", unit="state", disable=None):
         yield state
         if state[0] == last:
             break
@@ -231,7 +231,7 @@ def _draw_panel(ax: Axes, task: Task, mesh: Mesh, values: np.ndarray, currents: 
 
 
 def _size(task: Task, rows: int, columns: int) -> tuple[float, float]:
-    """inches of a figure with so many fields."""
+    """Return the size in inches of a figure with rows × columns fields."""
     extent = np.ptp(task.mesh.points, axis=0)
     length, height = (extent[2], extent[1]) if task.mesh.dim == 3 else extent
     width = 5.0 if length > 2 * height else 3.0

@@ -1,4 +1,4 @@
-"""The adaptivity gap of injection policies: the most that looking at the data can gain."""
+"""Normalised adaptivity gap of injection policies: largest benefit of using the measurements."""
 
 from __future__ import annotations
 
@@ -71,11 +71,11 @@ def adaptivity_gap(rows: pd.DataFrame, open_loop: Sequence[str] = OPEN_LOOP,
 
 
 def gap_text(rows: pd.DataFrame) -> str:
-    """Return the adaptivity gap in words; nothing if a policy for it is missing in an episode."""
+    """Return the normalised adaptivity gap as text; empty if a policy for it is missing in an episode."""
     try:
         gap, low, high = adaptivity_gap(rows)
     except ValueError:
         return ""
     interval = (f"95 % interval {low:.2f} to {high:.2f}" if math.isfinite(low)
                 else f"an interval takes {MIN_EPISODES} episodes")
-    return f"adaptivity gap {gap:.2f} ({interval}) over {rows['seed'].nunique()} episodes"
+    return f"normalised adaptivity gap {gap:.2f} ({interval}) over {rows['seed'].nunique()} episodes"

@@ -1,4 +1,4 @@
-"""One number of a world with several values: how the error follows it, as a table and a chart."""
+"""Sweep of one world parameter: the error for each value, as a table and a chart."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ MAX_METHOD_CHARS = 30
 
 
 class Sweep(NamedTuple):
-    """Errors of methods on one board of a world, for each value of a number of it."""
+    """Errors of methods on one leaderboard, for each value of a world parameter."""
 
     title: str
     """World and board."""
@@ -44,7 +44,7 @@ class Sweep(NamedTuple):
         fitted = table.fit_width(width, table.headings)
         hidden = len(table.headings) - len(fitted.headings)
         return "\n\n".join([f"{self.title}: ẽ_c for {self.parameter} =", fitted.markdown(),
-                            *[f"no room for {hidden} values"] * bool(hidden)])
+                            *[f"columns omitted: {hidden} values"] * bool(hidden)])
 
     def chart(self) -> charts.Chart | None:
         """Draw error over value; None unless all values are numbers."""

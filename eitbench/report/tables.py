@@ -1,5 +1,5 @@
 """Boards as tables for pages, Markdown and terminals. Agents that differ only in their training
-seed are one line of a page."""
+seed are one row of a page."""
 
 from __future__ import annotations
 
@@ -32,15 +32,17 @@ from eitbench.report.boards import (
 )
 
 INDEX_COLUMNS = ("seconds_per_step", "peak_memory")
-"""Numbers beside ranks and intervals in the index; the page of an environment has all."""
+"""Number columns of the index page; the page of an environment has all."""
 SKILL_AXIS_MIN = -1.0
-"""Lower end of the drawn axis of gains: a method twice as bad as the floor."""
-INTERVAL_HEADINGS = {"error": "ẽ_c", "gain": "gain"}
+"""Lower end of the axis of skill scores: twice the error of the naive baseline."""
+INTERVAL_HEADINGS = {"error": "ẽ_c", "gain": "skill score"}
 """Score with an interval -> heading."""
-COLUMN_PRIORITY = ("method", "ẽ_c", "withheld RMSE", "skill", "seeds", "NIS/m", "ms/step",
-                   "contrast", "ẽ_v")
-"""Where a line is too short the last of these are left out, and all other columns before them."""
+COLUMN_PRIORITY = ("method", "ẽ_c", "withheld RMSE", "normalised score", "seeds", "NIS/m", "ms/step",
+                   "contrast error", "contrast", "ẽ_v")
+"""Columns by priority in a narrow table; columns that are not listed are omitted first."""
 MAX_LABEL_CHARS = 30
+BADGES = {"floor": "naive baseline", "reference": "oracle"}
+"""Role in a record -> badge."""
 
 
 # -- trainings -------------------------------------------------------------------------------------
@@ -60,10 +62,10 @@ def agent_name(method: str) -> str:
 
 
 def group_by_agent(board: Leaderboard) -> list[AgentRow]:
-    """Return the lines of a board in its order.
+    """Return the rows of a leaderboard in its order, training seeds of an agent grouped.
 
-    The mean is over the ranked trainings, of which there must be two; its interval is over the
-    episodes, in each of which the scores of the trainings are averaged.
+    Agents with at least two ranked training seeds become one row: the mean over these seeds, with
+    the interval over the episodes of the seeds' mean scores.
     """
     groups: dict[tuple[str, bool], list[MethodRow]] = {}
     for row in board.rows:
@@ -108,7 +110,7 @@ def _agent_mean(board: Leaderboard, rows: list[MethodRow]) -> MethodRow:
 
 
 class ScoreAxes(NamedTuple):
-    """Drawn axes of intervals: one for each column, with a line at the floor."""
+    """Axes of interval columns, with a line at the naive baseline."""
 
     axes: dict[str, charts.Axis]
     marks: dict[str, float | None]
@@ -123,7 +125,7 @@ class ScoreAxes(NamedTuple):
                    {"error": zero, "gain": 0.0})
 
     def cell(self, row: MethodRow, name: str, parts: Sequence[MethodRow] = ()) -> Cell:
-        """Return a score with its interval, drawn and written, and the range of the trainings."""
+        """Return a score with its interval, drawn and written, and the range over the training seeds."""
         value, low, high = row.interval(name)
         if math.isnan(value):
             return Cell(MISSING)
@@ -147,8 +149,8 @@ class ScoreAxes(NamedTuple):
 
 
 def _axis_range(rows: Iterable[MethodRow], name: str) -> charts.Axis:
-    """Return the axis that holds all intervals of a column: of gains linear, cut at
-    `SKILL_AXIS_MIN`, else logarithmic."""
+    """Return the axis that holds all intervals of a column: linear for skill
+    scores, cut at `SKILL_AXIS_MIN`, otherwise logarithmic."""
     ends = [end for row in rows for end in row.interval(name) if math.isfinite(end)]
     if name == "gain":
         low, high = max(min([0.0, *ends]), SKILL_AXIS_MIN), 1.0
@@ -170,17 +172,17 @@ def _rank_cell(row: MethodRow, shared: Counter[int | None]) -> Cell:
     last = row.cells.get("last_rank", rank)
     if last > rank:
         return Cell(f"{rank}–{last}", float(rank))
-    return Cell(f"{rank}", float(rank), note="shared" if shared[rank] > 1 else "")
+    return Cell(f"{rank}", float(rank), note="tied" if shared[rank] > 1 else "")
 
 
 def method_cell(row: MethodRow, root: str, parts: Sequence[MethodRow] = (),
                 more: Iterable[str] = ()) -> Cell:
-    """Return title, name and badges of a method, linked to its page or with its trainings; ``more``
+    """Return title, name and badges of a method, linked to its page or with its training seeds; ``more``
     are further badges."""
     title = row.cells["title"]
-    badges = (*row.badges, *more)
+    badges = (*(BADGES.get(word, word) for word in row.badges), *more)
     if parts:
-        return Cell(title, title.casefold(), note=f"mean of {len(parts)} trainings", badges=badges)
+        return Cell(title, title.casefold(), note=f"mean of {len(parts)} training seeds", badges=badges)
     return Cell(title, title.casefold(), note=row.label, badges=badges,
                 link=f"{root}methods/{quote(row.cells['method'])}.html")
 
@@ -191,7 +193,7 @@ def author_badges(row: MethodRow) -> list[str]:
 
 
 def filter_flags(row: MethodRow) -> str:
-    """Return the words by which the filters of a page select."""
+    """Return the flags for the filters of a page."""
     return " ".join([*author_badges(row), *["unranked"] * row.unranked])
 
 
@@ -226,7 +228,7 @@ def page_table(board: Leaderboard, root: str, *, compact: bool = False) -> Table
 
 
 def _beaten_oracles(together: list[AgentRow]) -> dict[str, list[str]]:
-    """Return label of a reference -> a note that competing methods have a smaller error."""
+    """Return label of an oracle -> a note that ranked methods have a smaller error."""
     found = {}
     before: list[str] = []
     for row, _ in together:
@@ -234,17 +236,17 @@ def _beaten_oracles(together: list[AgentRow]) -> dict[str, list[str]]:
             before.append(row.cells["title"])
         elif before and "reference" in row.badges:
             better = before[0] if len(before) == 1 else f"{len(before)} others"
-            found[row.label] = [f"no bound: {better} better here"]
+            found[row.label] = [f"outperformed here by {better}"]
     return found
 
 
 def markdown_table(board: Leaderboard) -> Table:
-    """Return a board as text: one line for each record."""
+    """Return a board as text: one row for each record."""
     axes = ScoreAxes.of(board)
     shared = Counter(row.cells["rank"] for row in board.rows)
     return Table.of([{
         "rank": _rank_cell(row, shared), "method": method_cell(row, ""), **axes.cells(row),
-        "by": "".join(author_badges(row)) or "official",
+        "run by": "".join(author_badges(row)) or "official",
         **_number_cells(row, headings())} for row in board.rows], keep=["rank"])
 
 
@@ -253,8 +255,8 @@ def run_table(board: Leaderboard, *, title: str = "title", drawn: bool = False) 
 
     ``title`` is the field that names a method. Intervals are ``drawn``, or ± half the 95 % interval
     of the mean error is written. Measurements have the withheld RMSE in place of ẽ_c. Seeds have a
-    column if they differ. Policies have the paired difference of their error to that of the best
-    one that is not privileged.
+    column if they differ. Policies have the paired difference of their error to the error of the
+    best policy without privileged information.
     """
     axes = ScoreAxes.of(board)
     best = next((row for row in board.rows if row.complete and "privileged" not in row.badges),
@@ -280,14 +282,14 @@ def run_table(board: Leaderboard, *, title: str = "title", drawn: bool = False) 
             cells["ẽ_c"] = mean_cell(episode_errors(row.record).values())
         if best:
             own, other = episode_errors(row.record), episode_errors(best.record)
-            cells[f"worse than {best.cells['method']} by"] = Cell(MISSING) if row is best else (
+            cells[f"difference to {best.cells['method']}"] = Cell(MISSING) if row is best else (
                 mean_cell(own[seed] - other[seed] for seed in own.keys() & other.keys()))
         cells |= _number_cells(row, others)
         if row.cells["skill"] is None and row.cells.get("contrast_error") is not None:
             without = 1.0 - row.cells["contrast_error"]
-            cells["skill"] = Cell(f"{format_number(without)}†", without)
+            cells["normalised score"] = Cell(f"{format_number(without)}†", without)
         rows.append(cells)
-    keep = ["ẽ_c"] if board.category == "injection" else ["ẽ_c", "skill"]
+    keep = ["ẽ_c"] if board.category == "injection" else ["ẽ_c", "normalised score"]
     return Table.of(rows, label=board.title, keep=keep)
 
 
@@ -322,17 +324,17 @@ def terminal_tables(boards: Sequence[Leaderboard], characters: int) -> str:
         table = table._replace(rows=[row._replace(cells=[
             cell._replace(text=charts.truncate(cell.text, MAX_LABEL_CHARS)) for cell in row.cells])
             for row in table.rows])
-        worse = [heading for heading in table.headings if heading.startswith("worse than ")]
+        worse = [heading for heading in table.headings if heading.startswith("difference to ")]
         order = [*COLUMN_PRIORITY[:2], *worse, *COLUMN_PRIORITY[2:]]
         shown = table.fit_width(characters, order)
         left_out |= dict.fromkeys(heading for heading in table.headings
                                   if heading not in shown.headings)
         parts.append(f"{run_title(board)}\n\n{shown.markdown()}")
     if any("†" in part for part in parts):
-        parts.append("† 1 − contrast, since the references have no record of these episodes: 0 is\n"
-                     "the homogeneous estimate of the whole record, 1 no error at all")
+        parts.append("† 1 − contrast error, since the anchors of the normalised score have no record of\n"
+                     "these episodes: 0 is the homogeneous estimate, 1 a perfect estimate")
     if left_out:
-        parts.append(f"no room for {', '.join(left_out)}")
+        parts.append(f"columns omitted: {', '.join(left_out)}")
     return "\n\n".join(parts)
 
 
@@ -345,11 +347,11 @@ def markdown(boards: Sequence[Leaderboard]) -> str:
 # -- charts ----------------------------------------------------------------------------------------
 
 MAX_CURVES, N_HIGHLIGHTED = 7, 5
-"""Curves that can be told apart, and the number drawn strongly where there are more."""
+"""Largest number of distinct curves, and the number of highlighted curves beyond it."""
 
 
 def cost_chart(board: Leaderboard) -> charts.Chart | None:
-    """Draw error against computing time per step; the note names the methods on the front. None
+    """Draw error against computing time per step; the note names the methods on the Pareto front. None
     without data."""
     points = [charts.ParetoPoint(row.cells["title"], row.colour, row.cells["seconds_per_step"],
                            row.cells["error"], row.is_ranked)
@@ -358,7 +360,7 @@ def cost_chart(board: Leaderboard) -> charts.Chart | None:
     if not points:
         return None
     best = ", ".join(point.name for point in charts.pareto_front(points))
-    svg = charts.pareto_chart(points, "time per step on one core, ms", "relative error ẽ_c")
+    svg = charts.pareto_chart(points, "computing time per step on one core, ms", "relative error ẽ_c")
     return charts.Chart(svg, charts.legend(points), f": {best}" if best else "")
 
 
@@ -378,12 +380,12 @@ def curve_chart(board: Leaderboard) -> charts.Chart | None:
     steps = np.arange(1, max(len(each.values) for each in series) + 1)
     svg = charts.line_chart(steps, series, "scored state", "relative error")
     return charts.Chart(svg, charts.legend(each for each in series if not each.faint),
-                        " Thin: all other methods." if len(strong) < len(found) else "")
+                        " Thin lines: all other methods." if len(strong) < len(found) else "")
 
 
 def _highlighted_rows(rows: list[MethodRow]) -> list[MethodRow]:
-    """Return the rows with strong curves: all, or of many two floors or references and the best
-    others, trainings of one agent once."""
+    """Return the rows with highlighted curves: all, or two unranked rows and the best others, one
+    row for each agent."""
     if len(rows) <= MAX_CURVES:
         return rows
     chosen = [row for row in rows if row.unranked][:2]

@@ -174,8 +174,8 @@ def test_units_and_missing_values():
     scores = {"seconds_per_step": 0.0025, "voltage_discrepancy": 4e-6, "contrast_error": 0.25}
     (board,) = run_leaderboards([made("mine", "filter", [0.1], scores=scores), made("other", "filter", [0.2])])
     text = said(run_table(board))
-    assert (text["ms/step"][0], text["ẽ_V"][0], text["skill"][0]) == ("2.5", "4", "0.75†")
-    assert text["ẽ_V"][1] == text["skill"][1] == "–" and "CRPS" not in text
+    assert (text["ms/step"][0], text["ẽ_V"][0], text["normalised score"][0]) == ("2.5", "4", "0.75†")
+    assert text["ẽ_V"][1] == text["normalised score"][1] == "–" and "CRPS" not in text
 
 
 def test_the_drawn_table_has_bootstrap_intervals():
@@ -190,7 +190,7 @@ def test_terminal_tables_fit_and_name_what_is_left_out():
     scores = {"contrast_error": 0.2, "nis": 1.1, "crps": 1.0, "coverage_50": 0.5, "coverage_90": 0.9}
     found = run_leaderboards([made("mine", "filter", [0.1, 0.2], scores=scores), made("y" * 50, "filter", [0.2, 0.2])])
     title, table, note, missing = terminal_tables(found, 70).split("\n\n")
-    assert title == "Pipe2D-v0, filter, test:0-1" and note.startswith("† ") and missing.startswith("no room for ")
+    assert title == "Pipe2D-v0, filter, test:0-1" and note.startswith("† ") and missing.startswith("columns omitted: ")
     lines = table.splitlines()
     assert len(lines) == 4 and {len(line) for line in lines} == {len(lines[0])} and len(lines[0]) <= 70
     assert "y" * 29 + "…" in table and lines[1].split("|")[2].endswith(":")

@@ -217,7 +217,7 @@ def test_the_picture_can_be_stopped(flags, first, tmp_path):
         await image.decode();
         return [before, words, image.currentSrc];""", *flags)
     assert before.endswith(HEADLINE[first]) and after.endswith(HEADLINE[1 - first])
-    assert words == ["Stop the picture", "Play the picture"][first]
+    assert words == ["Pause", "Play"][first]
 
 
 @pytest.mark.parametrize("width", [390, 1280])

@@ -41,11 +41,11 @@ from eitbench.report.site import measured, robustness
 from eitbench.report.templates import markdown, markdown_list, render_template
 
 CATEGORY_TEXTS = {
-    "filter": "Estimates of each moment from the measurements until then.",
-    "fixed-lag": "Estimates of each moment from the measurements until a few later.",
-    "smoothing": "Estimates of each moment from the whole record.",
-    "stationary": "Targets that stand still.",
-    "injection": "The next current is chosen; a Kalman filter inside makes the estimate.",
+    "filter": "Each state is estimated from the measurements until then (filtering).",
+    "fixed-lag": "Each state is estimated from the measurements until a few steps later.",
+    "smoothing": "Each state is estimated from all measurements of the episode.",
+    "stationary": "Targets that do not move.",
+    "injection": "The policy chooses the next current; a built-in Kalman filter estimates the state.",
 }
 """Class -> task."""
 HEADLINE_ENVIRONMENT, AGENT_ENVIRONMENT = "eitbench-Pipe2D-v0", "eitbench-Pipe2DInjectionBudget-v0"
@@ -56,12 +56,12 @@ ROBUSTNESS_PAGE, MEASURED_PAGE = "robustness.html", "measured.html"
 HEADLINE = "headline.webp", "headline.png"
 """Animation of the first page, and its still picture. Others are named like an environment, as in
 eitbench-Pipe2D-v0.webp."""
-LINKS = {"How to submit": "README.md", "Statistics": "../docs/statistics.md",
+LINKS = {"Submit a method": "README.md", "Statistics": "../docs/statistics.md",
          "Code": "../README.md"}
 """Link of every page -> file, from the leaderboards' folder."""
 METHODS_FOLDER = "../baselines"
 """Folder of the built-in methods, from the leaderboards' folder."""
-PUBLIC_EPISODES = "The test episodes are public: anybody can simulate them."
+PUBLIC_EPISODES = "The test episodes are public: every user can simulate them."
 SITE_MARKER = b"<strong>eitbench</strong> leaderboards"
 """Text by which the index.html of a site is recognised."""
 
@@ -75,7 +75,7 @@ class Site(NamedTuple):
     """Sorted; superseded ones included."""
     measured: measured.MeasuredBoards = measured.EMPTY
     media: Mapping[str, int] = {}
-    """Name of each picture in the folder ``media`` beside the site -> bytes."""
+    """Name of each picture in the folder ``media`` next to the site -> bytes."""
     assets: frozenset[str] = frozenset()
     """Those of `LINKS` and `METHODS_FOLDER` that exist."""
 
@@ -98,7 +98,7 @@ class Site(NamedTuple):
         return render_template(f"site/{kind}.html.j2", root=root, links=links, **contents)
 
     def picture(self, name: str, root: str) -> str:
-        """Return the address of a picture; empty if there is none."""
+        """Return the address of a picture; empty if it is missing."""
         return f"{root}../media/{name}" if name in self.media else ""
 
 
@@ -140,8 +140,8 @@ def render(site: Site) -> dict[str, str]:
     """Return the content of ``leaderboard.csv`` and ``leaderboard.md``, by file name; records of
     measurement files are in the second only."""
     parts = ["# Leaderboards", "*Rendered from the records by `eitbench leaderboard --records "
-             "leaderboards/results`; [README.md](README.md) says how to add one.*",
-             PUBLIC_EPISODES if site.boards else "There are no records yet."]
+             "leaderboards/results`; [README.md](README.md) explains how to add one.*",
+             PUBLIC_EPISODES if site.boards else "No records yet."]
     for name, boards in site.classes.items():
         parts.append(f"## {name}")
         for board in boards:
@@ -152,7 +152,7 @@ def render(site: Site) -> dict[str, str]:
     if site.boards:
         parts += ["## Column descriptions", markdown_list(column_descriptions())]
     if outdated := split_outdated(site.records)[1]:
-        parts += ["## Superseded records", "Made by an earlier version of the method.\n\n"
+        parts += ["## Superseded records", "From an earlier version of the method.\n\n"
                   + "\n".join(f"- {escape_markdown(record_file_name(record))}"
                               for record in outdated)]
     table = leaderboard_table(site.boards)
@@ -229,18 +229,17 @@ def headline(site: Site) -> Headline | None:
     if not 2 <= times < len(MULTIPLES) + 2:
         return None
     return Headline(
-        f"A flow model cuts the error {MULTIPLES[int(times) - 2]}fold",
-        f"Images of a target that is assumed to stand still (Gauss–Newton) have an error of "
-        f"{stationary:#.2g}, those of an extended Kalman filter with a model of the flow "
-        f"{filtered:#.2g}: {times:.1f} times less, or {math.sqrt(times):.1f} times by its root. "
-        f"The error is the squared distance from the truth over the square of the truth, the mean "
-        f"over {board.seeds} of {board.title}. The best homogeneous image has {flat:#.2g}.",
+        f"A flow model reduces the error {MULTIPLES[int(times) - 2]}fold",
+        f"Stationary reconstruction (Gauss–Newton) has a relative squared error of {stationary:#.2g}, "
+        f"an extended Kalman filter with a flow model {filtered:#.2g}: {times:.1f} times less, or "
+        f"{math.sqrt(times):.1f} times less in its square root. The error is ‖ĉ − c‖²/‖c‖², "
+        f"averaged over {board.seeds} of {board.title}. The best homogeneous image has {flat:#.2g}.",
         KeyFigure(f"{flat / filtered:.1f} ×", "less error than the best homogeneous image: the "
                   f"extended Kalman filter on {board.title}", board))
 
 
 def key_figures(site: Site) -> list[KeyFigure]:
-    """Return up to two: gains of the best filter and of the best trained agent."""
+    """Return up to two: skill scores of the best filter and of the best trained agent."""
     def best(board: Leaderboard | None, *, trained: bool | None = None) -> tables.AgentRow | None:
         return next((line for line in (tables.group_by_agent(board) if board else ())
                      if line.row.is_ranked and trained in (None, bool(line.parts))), None)
@@ -253,7 +252,7 @@ def key_figures(site: Site) -> list[KeyFigure]:
     if board and (first := best(board)):
         count = sum(each.category == "filter" and each.environment in aggregate_environments()
                     for each in site.boards)
-        found.append(KeyFigure(percent(first), "less error than the floor with the best filter "
+        found.append(KeyFigure(percent(first), "less error than the naive baseline with the best filter "
                                f"({first.row.cells['title']}), over {count} environments", board))
     board = site.board("injection", AGENT_ENVIRONMENT)
     agent, rule = best(board, trained=True), best(board, trained=False)
@@ -261,7 +260,7 @@ def key_figures(site: Site) -> list[KeyFigure]:
         found.append(KeyFigure(
             percent(agent), "less error than random pairs with an agent trained to choose when "
             f"and where to inject ({agent.row.cells['title']}, mean of {len(agent.parts)} "
-            f"trainings, on {board.title}); {percent(rule)} with the best written rule", board))
+            f"training seeds, on {board.title}); {percent(rule)} with the best rule-based policy", board))
     return found
 
 
@@ -316,21 +315,21 @@ def method_page(site: Site, name: str) -> bytes:
 
 
 def _placements(placements: list[tuple[Leaderboard, MethodRow]]) -> tuple[Table, dict[str, Markup]]:
-    """Return one row for each board, and the axes of gains, which all rows share."""
+    """Return one row for each board, and the axes of skill scores that all rows share."""
     gains = tables.ScoreAxes.of(Leaderboard("", ALL, "", [row for _, row in placements]))
     rows = []
     for board, row in placements:
         rank = row.cells["rank"]
         link = f"../index.html#{board.anchor}" if board.is_aggregate else f"../{board.address}"
         rows.append({
-            "board": Cell(board.title, board.title.casefold(), link=link,
+            "leaderboard": Cell(board.title, board.title.casefold(), link=link,
                           note=f"{board.category} · {row.cells['version']}", badges=row.badges),
             "rank": Cell(MISSING) if rank is None else Cell(
                 str(rank), float(rank), note=f"of {sum(each.is_ranked for each in board.rows)}"),
-            "ẽ_c": tables.ScoreAxes.of(board).cell(row, "error"), "gain": gains.cell(row, "gain"),
+            "ẽ_c": tables.ScoreAxes.of(board).cell(row, "error"), "skill score": gains.cell(row, "gain"),
             "ms/step": number_cell(row.cells["seconds_per_step"])})
-    table = Table.of(rows, label="Boards", keep=list(rows[0]) if rows else ())
-    return table, {"gain": gains.headers()["gain"]}
+    table = Table.of(rows, label="Results", keep=list(rows[0]) if rows else ())
+    return table, {"skill score": gains.headers()["skill score"]}
 
 
 def _version(records: list[dict[str, Any]], addresses: dict[tuple[str, str], str],

@@ -1,7 +1,7 @@
-"""The measured board: residuals of withheld readings of real instruments, by method.
+"""Leaderboards of measured data: residuals of withheld measurements of real instruments.
 
-The episodes of a case withhold different readings of the same measurements. They are not
-independent, so the board orders methods without ranks.
+The episodes of a case withhold different fractions of the same measurements. They are not
+independent, so methods are ordered but not ranked.
 """
 
 from __future__ import annotations
@@ -19,14 +19,15 @@ from eitbench.bench.table import Cell, Table, number_cell
 from eitbench.bench.text import format_number, scores_by_seed
 from eitbench.bench.tracks import registered_kwargs
 from eitbench.measured.cases import MeasuredCase, read_case
+from eitbench.report.tables import BADGES
 from eitbench.report.templates import markdown_list
 
 MEASURED_COLUMNS = {each.heading: each.explanation for each in scores("measured").values()
             if each.name != "error"} | {
     "relative":
-        "withheld RMSE relative to that of the best naive baseline, geometric mean over the cases "
-        "of a method; lower is better",
-    "floor": "naive baseline: homogeneous fluid, or the last complete frame alone",
+        "withheld RMSE of the method divided by the smallest one of a naive baseline, geometric "
+        "mean over the cases of a method; lower is better",
+    "naive baseline": "homogeneous fluid, or the last complete frame alone",
 }
 """Explanations of the board's headings and marks."""
 
@@ -99,7 +100,7 @@ def markdown_section(measured: MeasuredBoards) -> list[str]:
     """Render the section of the boards as Markdown, in parts; none without records."""
     if not measured.records:
         return []
-    parts = ["## measured", "Measurements of real instruments: RMS residual of withheld readings, "
+    parts = ["## measured", "Measurements of real instruments: RMS residual of withheld measurements, "
              "relative to the standard deviation of the noise.",
              measured.all_cases_table().markdown()]
     for name, case in measured.cases.items():
@@ -123,7 +124,7 @@ def _score_cell(record: dict[str, Any], score: str, *, spread: bool = False) -> 
 
 def _method_cell(record: dict[str, Any], title: str = "") -> Cell:
     """Name and version with badges, below a title if there is one."""
-    badges = [*filter(None, [record["role"]]), *["self-reported"] * (not record["official"])]
+    badges = [*filter(None, [BADGES.get(record["role"], record["role"])]), *["self-reported"] * (not record["official"])]
     shown = title or _label(record)
     return Cell(shown, shown.casefold(), note=_label(record) if title else "",
                 badges=tuple(badges))

@@ -1,8 +1,7 @@
-"""The robustness board: scores in the nominal world, and where the truth differs from the model.
+"""Robustness leaderboard: scores in the nominal and in shifted environments.
 
-Errors of two worlds are not comparable: strong slugs are a larger part of the truth. Methods are
-therefore judged by their gains, each relative to the floor in the same world, and ordered by the
-least.
+Errors of two environments are not comparable, since strong slugs are a larger fraction of the
+truth. Methods are therefore ordered by their lowest skill score.
 """
 
 from __future__ import annotations
@@ -23,19 +22,19 @@ from eitbench.report.tables import author_badges, filter_flags, method_cell
 from eitbench.report.templates import markdown, markdown_list
 from eitbench.worlds.registry import entry
 
-WORSE_THAN_NAIVE = "below the floor"
+WORSE_THAN_NAIVE = "worse than naive"
 ROBUSTNESS_COLUMNS = {
-    "nominal": "ẽ_c in the world of the model: squared distance from the truth over the square of "
-               "the truth, mean over the episodes; lower is better",
-    "a shift": "ẽ_c where one property differs from the model and from the training episodes, and "
-               "its ratio to the nominal one",
-    WORSE_THAN_NAIVE: "ẽ_c is larger than that of the best floor in the same world",
-    "mean gain": "gain over the floor in the same world, as on the boards (0 as the floor, 1 "
-                 "perfect): the mean of all shifts",
-    "least gain": "the least of these gains, and its shift; the board is ordered by it. Methods "
-                  "that have not finished all shifts have neither. Ratios alone would favour "
-                  "methods with a large nominal error",
-    "reference": "has the true flow, but the nominal noise, contacts and slugs; it is not a bound",
+    "nominal": "ẽ_c = ‖ĉ − c‖²/‖c‖² in the nominal environment, whose truth agrees with the model; "
+               "mean over the episodes, dimensionless; lower is better",
+    "shifted": "ẽ_c in an environment where one property of the truth differs from the model and "
+               "the training episodes, and its ratio to the nominal ẽ_c",
+    WORSE_THAN_NAIVE: "ẽ_c exceeds the smallest ẽ_c of a naive baseline in the same environment",
+    "mean skill score": "skill score 1 − ẽ_c / ẽ_c of the naive baseline in the same environment, "
+                        "mean over all shifts: 0 equals the baseline, 1 is perfect",
+    "lowest skill score": "smallest skill score over the shifts, and the shift; orders the table. "
+                          "Missing unless all shifts are finished. Ratios alone would favour "
+                          "methods with a large nominal error",
+    "oracle": "uses the true flow, but nominal noise, contacts and slugs; it is not a bound",
 }
 """Heading or mark -> explanation."""
 
@@ -59,7 +58,7 @@ class ShiftFamily(NamedTuple):
 
     @property
     def table(self) -> Table:
-        """The largest least gain first, unfinished methods last."""
+        """Table by decreasing lowest skill score, unfinished methods last."""
         nominal = {row.label: row for row in self.nominal.rows} if self.nominal else {}
         shifted = {name: {row.label: row for row in board.rows}
                    for name, board in self.shifts.items()}
@@ -75,8 +74,8 @@ class ShiftFamily(NamedTuple):
                                             "nominal": _error_cell(home)}
             cells |= {name: _error_cell(own.get(name), home, floors[name]) for name in self.shifts}
             least = min(gains, key=gains.__getitem__) if gains.keys() == shifted.keys() else ""
-            cells["mean gain"] = number_cell(fmean(gains.values()) if least else None)
-            cells["least gain"] = Cell(format_number(gains[least]), gains[least],
+            cells["mean skill score"] = number_cell(fmean(gains.values()) if least else None)
+            cells["lowest skill score"] = Cell(format_number(gains[least]), gains[least],
                                        note=least) if least else Cell(MISSING)
             lines.append((-gains[least] if least else math.inf, cells, filter_flags(row)))
         lines.sort(key=lambda line: line[0])
@@ -106,7 +105,7 @@ def shift_heading(id: str, home: str) -> str:
 
 
 def _best_naive_error(board: Leaderboard) -> float:
-    """Return the least ẽ_c of a board's floors, official ones where there are any; else ∞."""
+    """Return the smallest ẽ_c of the naive baselines, official ones where they exist; else ∞."""
     floors = [row for row in board.rows if "floor" in row.badges and row.complete]
     official = [row for row in floors if row.cells["official"]]
     return min((row.cells["error"] for row in official or floors), default=math.inf)
@@ -114,7 +113,7 @@ def _best_naive_error(board: Leaderboard) -> float:
 
 def _error_cell(row: MethodRow | None, home: MethodRow | None = None,
                 floor: float = math.inf) -> Cell:
-    """Return ẽ_c, its ratio to the nominal one, and marks: worse than the floor, unfinished."""
+    """Return ẽ_c, its ratio to the nominal one, and badges: worse than naive, unfinished."""
     if row is None:
         return Cell(MISSING)
     error = row.cells["error"]
@@ -133,8 +132,8 @@ def markdown_section(boards: Iterable[Leaderboard]) -> list[str]:
     found = shift_families(boards)
     if not found:
         return []
-    parts = ["## robustness", "Scores where the truth differs from the model, beside nominal ones; "
-             "ordered by the least gain over the floor in the same world."]
+    parts = ["## robustness", "Scores in nominal and shifted environments, ordered by the lowest "
+             "skill score."]
     for family in found:
         parts += [f"### {family.table.label}", family.table.markdown()]
     return [*parts, markdown_list(ROBUSTNESS_COLUMNS)]
