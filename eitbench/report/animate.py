@@ -36,8 +36,8 @@ def animate(environment: str, methods: Sequence[str], seed: str, step: int | Non
     """Run estimators or one policy on an episode and draw every ``every``-th scored state, or only
     state ``step``, into ``path``. Estimates of several methods are drawn below the truth.
 
-    ``ValueError`` if a method is not compatible with the environment, several are policies, or the path's
-    suffix is not .gif or .webp (.png with ``step``).
+    ``ValueError`` if a method is not compatible with the environment, several are policies, or
+    the path's suffix is not .gif or .webp (.png with ``step``).
     """
     suffixes = ANIMATION_SUFFIXES if step is None else (".png",)
     if path.suffix not in suffixes:
@@ -95,7 +95,7 @@ def _compared_frames(env: Any, loaded: list[Method], seed: int, at: range) -> It
 
 
 def _palette() -> Image.Image:
-    """Return the 256 colours of all frames, which keeps them constant: colour maps, greys, electrodes."""
+    """Return the 256 colours shared by all frames: colour maps, greys, electrodes."""
     colours = [colormaps[name](np.linspace(0, 1, n))[:, :3]
                for name, n in ((FIELD_COLORMAP, 120), (STD_COLORMAP, 100))]
     greys = np.linspace(0, 1, 27)[:, None].repeat(3, axis=1)

@@ -78,8 +78,8 @@ COST_COLUMNS = {
         "dimensionless"),
     "peak_memory": ("peak memory (MB)", "peak memory of the method's process, 10⁶ bytes"),
 }
-_RANK = ("1 + the number of methods that are significantly better (paired bootstrap, 95 %); methods "
-         "without a significant difference are tied. Naive baselines, oracles, privileged methods "
+_RANK = ("1 + the number of methods that are significantly better (paired bootstrap, 95 %); "
+         "methods without a significant difference are tied. Naive baselines, oracles, privileged methods "
          "and methods with missing or failed episodes are not ranked")
 
 

@@ -234,8 +234,8 @@ def _format_tick(tick: float) -> str:
 
 def _free_position(x: float, y: float, width: float, taken: list[tuple[float, float, float, float]]
           ) -> tuple[float, float, str] | None:
-    """Return where a name of this width fits next to (x, y) without overlapping ``taken``, to which it is
-    added."""
+    """Return where a name of this width fits next to (x, y) without overlapping ``taken``, to which
+    it is added."""
     for dx, dy, anchor in ((10, 4, "start"), (-10, 4, "end"), (6, -9, "start"), (6, 18, "start"),
                            (-6, -9, "end"), (-6, 18, "end")):
         left = x + dx - width * (anchor == "end")

@@ -59,8 +59,8 @@ def write_page(store: EpisodeStore, boards: Sequence[Leaderboard],
 
 
 def _snapshots(store: EpisodeStore, board: Leaderboard) -> dict[str, Any] | None:
-    """Return truth and estimates of the best methods, without naive baselines, in one episode, as PNG data; None
-    if their estimates are missing or do not fit the states."""
+    """Return truth and estimates of the best methods, without naive baselines, in one episode, as
+    PNG data; None if their estimates are missing or do not fit the states."""
     chosen = [(row, {episode["seed"] for episode in row.record["episodes"]
                      if episode["status"] == "ok"})
               for row in board.rows if row.record and "floor" not in row.badges]

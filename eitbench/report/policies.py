@@ -71,11 +71,12 @@ def adaptivity_gap(rows: pd.DataFrame, open_loop: Sequence[str] = OPEN_LOOP,
 
 
 def gap_text(rows: pd.DataFrame) -> str:
-    """Return the normalised adaptivity gap as text; empty if a policy for it is missing in an episode."""
+    """Return the normalised adaptivity gap as text; empty if an episode lacks a policy for it."""
     try:
         gap, low, high = adaptivity_gap(rows)
     except ValueError:
         return ""
     interval = (f"95 % interval {low:.2f} to {high:.2f}" if math.isfinite(low)
                 else f"an interval takes {MIN_EPISODES} episodes")
-    return f"normalised adaptivity gap {gap:.2f} ({interval}) over {rows['seed'].nunique()} episodes"
+    episodes = f"{rows['seed'].nunique()} episodes"
+    return f"normalised adaptivity gap {gap:.2f} ({interval}) over {episodes}"

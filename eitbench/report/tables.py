@@ -37,8 +37,8 @@ SKILL_AXIS_MIN = -1.0
 """Lower end of the axis of skill scores: twice the error of the naive baseline."""
 INTERVAL_HEADINGS = {"error": "ẽ_c", "gain": "skill score"}
 """Score with an interval -> heading."""
-COLUMN_PRIORITY = ("method", "ẽ_c", "withheld RMSE", "normalised score", "seeds", "NIS/m", "ms/step",
-                   "contrast error", "contrast", "ẽ_v")
+COLUMN_PRIORITY = ("method", "ẽ_c", "withheld RMSE", "normalised score", "seeds", "NIS/m",
+                   "ms/step", "contrast error", "contrast", "ẽ_v")
 """Columns by priority in a narrow table; columns that are not listed are omitted first."""
 MAX_LABEL_CHARS = 30
 BADGES = {"floor": "naive baseline", "reference": "oracle"}
@@ -125,7 +125,7 @@ class ScoreAxes(NamedTuple):
                    {"error": zero, "gain": 0.0})
 
     def cell(self, row: MethodRow, name: str, parts: Sequence[MethodRow] = ()) -> Cell:
-        """Return a score with its interval, drawn and written, and the range over the training seeds."""
+        """Return a score with its interval, drawn and as text, and the range over training seeds."""
         value, low, high = row.interval(name)
         if math.isnan(value):
             return Cell(MISSING)
@@ -177,12 +177,13 @@ def _rank_cell(row: MethodRow, shared: Counter[int | None]) -> Cell:
 
 def method_cell(row: MethodRow, root: str, parts: Sequence[MethodRow] = (),
                 more: Iterable[str] = ()) -> Cell:
-    """Return title, name and badges of a method, linked to its page or with its training seeds; ``more``
-    are further badges."""
+    """Return title, name and badges of a method, linked to its page or with its training seeds;
+    ``more`` are further badges."""
     title = row.cells["title"]
     badges = (*(BADGES.get(word, word) for word in row.badges), *more)
     if parts:
-        return Cell(title, title.casefold(), note=f"mean of {len(parts)} training seeds", badges=badges)
+        return Cell(title, title.casefold(), note=f"mean of {len(parts)} training seeds",
+                    badges=badges)
     return Cell(title, title.casefold(), note=row.label, badges=badges,
                 link=f"{root}methods/{quote(row.cells['method'])}.html")
 
@@ -331,8 +332,8 @@ def terminal_tables(boards: Sequence[Leaderboard], characters: int) -> str:
                                   if heading not in shown.headings)
         parts.append(f"{run_title(board)}\n\n{shown.markdown()}")
     if any("†" in part for part in parts):
-        parts.append("† 1 − contrast error, since the anchors of the normalised score have no record of\n"
-                     "these episodes: 0 is the homogeneous estimate, 1 a perfect estimate")
+        parts.append("† 1 − contrast error, since the anchors of the normalised score have no record\n"
+                     "of these episodes: 0 is the homogeneous estimate, 1 a perfect estimate")
     if left_out:
         parts.append(f"columns omitted: {', '.join(left_out)}")
     return "\n\n".join(parts)
@@ -351,8 +352,8 @@ MAX_CURVES, N_HIGHLIGHTED = 7, 5
 
 
 def cost_chart(board: Leaderboard) -> charts.Chart | None:
-    """Draw error against computing time per step; the note names the methods on the Pareto front. None
-    without data."""
+    """Draw error against computing time per step; the note names the methods on the Pareto front.
+    None without data."""
     points = [charts.ParetoPoint(row.cells["title"], row.colour, row.cells["seconds_per_step"],
                            row.cells["error"], row.is_ranked)
               for row, _ in group_by_agent(board)
@@ -360,7 +361,8 @@ def cost_chart(board: Leaderboard) -> charts.Chart | None:
     if not points:
         return None
     best = ", ".join(point.name for point in charts.pareto_front(points))
-    svg = charts.pareto_chart(points, "computing time per step on one core, ms", "relative error ẽ_c")
+    svg = charts.pareto_chart(points, "computing time per step on one core, ms",
+                              "relative error ẽ_c")
     return charts.Chart(svg, charts.legend(points), f": {best}" if best else "")
 
 

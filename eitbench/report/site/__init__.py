@@ -45,7 +45,7 @@ CATEGORY_TEXTS = {
     "fixed-lag": "Each state is estimated from the measurements until a few steps later.",
     "smoothing": "Each state is estimated from all measurements of the episode.",
     "stationary": "Targets that do not move.",
-    "injection": "The policy chooses the next current; a built-in Kalman filter estimates the state.",
+    "injection": "The policy chooses the next current; a built-in filter estimates the state.",
 }
 """Class -> task."""
 HEADLINE_ENVIRONMENT, AGENT_ENVIRONMENT = "eitbench-Pipe2D-v0", "eitbench-Pipe2DInjectionBudget-v0"
@@ -230,10 +230,11 @@ def headline(site: Site) -> Headline | None:
         return None
     return Headline(
         f"A flow model reduces the error {MULTIPLES[int(times) - 2]}fold",
-        f"Stationary reconstruction (Gauss–Newton) has a relative squared error of {stationary:#.2g}, "
-        f"an extended Kalman filter with a flow model {filtered:#.2g}: {times:.1f} times less, or "
+        f"Stationary reconstruction (Gauss–Newton) has a relative squared error of "
+        f"{stationary:#.2g}, an extended Kalman filter with a flow model {filtered:#.2g}: {times:.1f} times less, or "
         f"{math.sqrt(times):.1f} times less in its square root. The error is ‖ĉ − c‖²/‖c‖², "
-        f"averaged over {board.seeds} of {board.title}. The best homogeneous image has {flat:#.2g}.",
+        f"averaged over {board.seeds} of {board.title}. "
+        f"The best homogeneous image has {flat:#.2g}.",
         KeyFigure(f"{flat / filtered:.1f} ×", "less error than the best homogeneous image: the "
                   f"extended Kalman filter on {board.title}", board))
 
@@ -252,15 +253,16 @@ def key_figures(site: Site) -> list[KeyFigure]:
     if board and (first := best(board)):
         count = sum(each.category == "filter" and each.environment in aggregate_environments()
                     for each in site.boards)
-        found.append(KeyFigure(percent(first), "less error than the naive baseline with the best filter "
-                               f"({first.row.cells['title']}), over {count} environments", board))
+        found.append(KeyFigure(percent(first), "less error than the naive baseline with the best "
+                               f"filter ({first.row.cells['title']}), over {count} environments", board))
     board = site.board("injection", AGENT_ENVIRONMENT)
     agent, rule = best(board, trained=True), best(board, trained=False)
     if board and agent and rule:
         found.append(KeyFigure(
             percent(agent), "less error than random pairs with an agent trained to choose when "
             f"and where to inject ({agent.row.cells['title']}, mean of {len(agent.parts)} "
-            f"training seeds, on {board.title}); {percent(rule)} with the best rule-based policy", board))
+            f"training seeds, on {board.title}); {percent(rule)} with the best rule-based policy",
+            board))
     return found
 
 
@@ -326,7 +328,8 @@ def _placements(placements: list[tuple[Leaderboard, MethodRow]]) -> tuple[Table,
                           note=f"{board.category} · {row.cells['version']}", badges=row.badges),
             "rank": Cell(MISSING) if rank is None else Cell(
                 str(rank), float(rank), note=f"of {sum(each.is_ranked for each in board.rows)}"),
-            "ẽ_c": tables.ScoreAxes.of(board).cell(row, "error"), "skill score": gains.cell(row, "gain"),
+            "ẽ_c": tables.ScoreAxes.of(board).cell(row, "error"),
+            "skill score": gains.cell(row, "gain"),
             "ms/step": number_cell(row.cells["seconds_per_step"])})
     table = Table.of(rows, label="Results", keep=list(rows[0]) if rows else ())
     return table, {"skill score": gains.headers()["skill score"]}

@@ -100,8 +100,8 @@ def markdown_section(measured: MeasuredBoards) -> list[str]:
     """Render the section of the boards as Markdown, in parts; none without records."""
     if not measured.records:
         return []
-    parts = ["## measured", "Measurements of real instruments: RMS residual of withheld measurements, "
-             "relative to the standard deviation of the noise.",
+    parts = ["## measured", "Measurements of real instruments: RMS residual of withheld "
+             "measurements, relative to the standard deviation of the noise.",
              measured.all_cases_table().markdown()]
     for name, case in measured.cases.items():
         parts += [f"### {name}", f"{case.title}. Data: {case.source}, {case.file}; licence: "
@@ -124,7 +124,8 @@ def _score_cell(record: dict[str, Any], score: str, *, spread: bool = False) -> 
 
 def _method_cell(record: dict[str, Any], title: str = "") -> Cell:
     """Name and version with badges, below a title if there is one."""
-    badges = [*filter(None, [BADGES.get(record["role"], record["role"])]), *["self-reported"] * (not record["official"])]
+    badges = [*filter(None, [BADGES.get(record["role"], record["role"])]),
+              *["self-reported"] * (not record["official"])]
     shown = title or _label(record)
     return Cell(shown, shown.casefold(), note=_label(record) if title else "",
                 badges=tuple(badges))
