@@ -79,8 +79,8 @@ COST_COLUMNS = {
     "peak_memory": ("peak memory (MB)", "peak memory of the method's process, 10⁶ bytes"),
 }
 _RANK = ("1 + the number of methods that are significantly better (paired bootstrap, 95 %); "
-         "methods without a significant difference are tied. Naive baselines, oracles, privileged methods "
-         "and methods with missing or failed episodes are not ranked")
+         "methods without a significant difference are tied. Naive baselines, oracles, privileged "
+         "methods and methods with missing or failed episodes are not ranked")
 
 
 class MethodRow(NamedTuple):

@@ -125,7 +125,7 @@ class ScoreAxes(NamedTuple):
                    {"error": zero, "gain": 0.0})
 
     def cell(self, row: MethodRow, name: str, parts: Sequence[MethodRow] = ()) -> Cell:
-        """Return a score with its interval, drawn and as text, and the range over training seeds."""
+        """Return a score with its interval, drawn and as text, and the range of seeds."""
         value, low, high = row.interval(name)
         if math.isnan(value):
             return Cell(MISSING)
@@ -332,8 +332,8 @@ def terminal_tables(boards: Sequence[Leaderboard], characters: int) -> str:
                                   if heading not in shown.headings)
         parts.append(f"{run_title(board)}\n\n{shown.markdown()}")
     if any("†" in part for part in parts):
-        parts.append("† 1 − contrast error, since the anchors of the normalised score have no record\n"
-                     "of these episodes: 0 is the homogeneous estimate, 1 a perfect estimate")
+        parts.append("† 1 − contrast error, since the anchors of the normalised score have no\n"
+                     "record of these episodes: 0 is the homogeneous estimate, 1 a perfect estimate")
     if left_out:
         parts.append(f"columns omitted: {', '.join(left_out)}")
     return "\n\n".join(parts)

@@ -231,8 +231,8 @@ def headline(site: Site) -> Headline | None:
     return Headline(
         f"A flow model reduces the error {MULTIPLES[int(times) - 2]}fold",
         f"Stationary reconstruction (Gauss–Newton) has a relative squared error of "
-        f"{stationary:#.2g}, an extended Kalman filter with a flow model {filtered:#.2g}: {times:.1f} times less, or "
-        f"{math.sqrt(times):.1f} times less in its square root. The error is ‖ĉ − c‖²/‖c‖², "
+        f"{stationary:#.2g}, an extended Kalman filter with a flow model {filtered:#.2g}: "
+        f"{times:.1f} times less, or {math.sqrt(times):.1f} times less in its square root. The error is ‖ĉ − c‖²/‖c‖², "
         f"averaged over {board.seeds} of {board.title}. "
         f"The best homogeneous image has {flat:#.2g}.",
         KeyFigure(f"{flat / filtered:.1f} ×", "less error than the best homogeneous image: the "
@@ -254,7 +254,8 @@ def key_figures(site: Site) -> list[KeyFigure]:
         count = sum(each.category == "filter" and each.environment in aggregate_environments()
                     for each in site.boards)
         found.append(KeyFigure(percent(first), "less error than the naive baseline with the best "
-                               f"filter ({first.row.cells['title']}), over {count} environments", board))
+                               f"filter ({first.row.cells['title']}), over {count} environments",
+                               board))
     board = site.board("injection", AGENT_ENVIRONMENT)
     agent, rule = best(board, trained=True), best(board, trained=False)
     if board and agent and rule:
