@@ -88,7 +88,7 @@ class Table(NamedTuple):
     def omitted_columns(self, fitted: Table) -> str:
         """Return a line that names the columns that a `fitted` table lacks, or nothing."""
         missing = [heading for heading in self.headings if heading not in fitted.headings]
-        return f"no room for {', '.join(missing)}" if missing else ""
+        return f"columns omitted: {', '.join(missing)}" if missing else ""
 
     def markdown(self) -> str:
         """Return aligned Markdown."""

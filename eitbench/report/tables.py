@@ -333,7 +333,7 @@ def terminal_tables(boards: Sequence[Leaderboard], characters: int) -> str:
         parts.append(f"{run_title(board)}\n\n{shown.markdown()}")
     if any("†" in part for part in parts):
         parts.append("† 1 − contrast error, since the anchors of the normalised score have no\n"
-                     "record of these episodes: 0 is the homogeneous estimate, 1 a perfect estimate")
+                     "record of these episodes: 0 is the homogeneous estimate, 1 a perfect one")
     if left_out:
         parts.append(f"columns omitted: {', '.join(left_out)}")
     return "\n\n".join(parts)

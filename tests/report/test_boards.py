@@ -245,7 +245,7 @@ def test_csv_and_markdown_agree_with_the_episodes(folder):
         ranked = row["rank"] > 0
         assert cells["rank"].split()[0] == (f"{row['rank']:.0f}" if ranked else "–")
         assert ranked or cells["method"].endswith(f"({row['note']})")
-        assert cells["by"] == ("official" if row["official"] else "self-reported")
+        assert cells["run by"] == ("official" if row["official"] else "self-reported")
     assert "All environments" in texts["leaderboard.md"] and (table["environment"] == ALL).sum() == 2
 
 

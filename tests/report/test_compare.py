@@ -86,7 +86,7 @@ def test_over_environments_gains_are_compared():
     gains = on_boards[on_boards["environment"] == "all"].set_index("method")["gain"]
     assert (table["a"][2], table["b"][2]) == pytest.approx((gains["a"], gains["b"]), rel=1e-12)
     text = said(comparison_table(table, "a", "b"))
-    assert list(text["better"]) == ["a", "b", "a"] and text["ẽ_c of a"][2].startswith("gain 0.")
+    assert list(text["better"]) == ["a", "b", "a"] and text["ẽ_c of a"][2].startswith("skill score 0.")
     assert list(compare(a, b)["environment"]) == [PIPE_NAME, TANK_NAME]
     others = compare(a, b, "seconds_per_step", floor)
     assert list(others["environment"]) == [PIPE_NAME, TANK_NAME, "all"]
@@ -109,13 +109,13 @@ def test_what_cannot_be_compared():
     a = [record("a", [0.1])]
     for b in ([record("b", [0.1], id=TANK)], [record("b", {"test:9": 0.1})], [record("b", {"dev:0": 0.1})],
               [record("b", [None])]):
-        with pytest.raises(ValueError, match="no environment in which both have finished an episode"):
+        with pytest.raises(ValueError, match="methods must share an environment and a seed"):
             compare(a, b)
 
 
 def test_records_are_found_by_name_version_and_file(tmp_path, monkeypatch):
     """A name is enough where there is one version of it."""
-    monkeypatch.setattr(comparison, "SHIPPED", tmp_path)
+    monkeypatch.setattr(comparison, "BUNDLED_RECORDS", tmp_path)
     a, (b, _) = two_methods()
     paths = [write_record(tmp_path, each) for each in [*a, b]]
     assert find_records("a", tmp_path) == a and find_records(f"a@{sha('a1')[:4]}", tmp_path) == a
@@ -158,7 +158,7 @@ def test_words_follow_from_the_intervals():
 def test_who_is_not_in_the_folder_comes_with_the_package(tmp_path, monkeypatch):
     """After a first submission, in a folder of one's own: my method against ours, and our floors."""
     shipped, own = tmp_path / "shipped", tmp_path / "own"
-    monkeypatch.setattr(comparison, "SHIPPED", shipped)
+    monkeypatch.setattr(comparison, "BUNDLED_RECORDS", shipped)
     ours, floor = record("kalman_filter", [0.1], version="v1"), record("homogeneous", [0.2], role="floor")
     for folder, each in ((own, mine := record("mine", [0.1])), (shipped, ours), (shipped, floor)):
         write_record(folder, each)

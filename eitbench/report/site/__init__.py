@@ -232,7 +232,8 @@ def headline(site: Site) -> Headline | None:
         f"A flow model reduces the error {MULTIPLES[int(times) - 2]}fold",
         f"Stationary reconstruction (Gauss–Newton) has a relative squared error of "
         f"{stationary:#.2g}, an extended Kalman filter with a flow model {filtered:#.2g}: "
-        f"{times:.1f} times less, or {math.sqrt(times):.1f} times less in its square root. The error is ‖ĉ − c‖²/‖c‖², "
+        f"{times:.1f} times less, or {math.sqrt(times):.1f} times less in its square root. "
+        f"The error is ‖ĉ − c‖²/‖c‖², "
         f"averaged over {board.seeds} of {board.title}. "
         f"The best homogeneous image has {flat:#.2g}.",
         KeyFigure(f"{flat / filtered:.1f} ×", "less error than the best homogeneous image: the "
