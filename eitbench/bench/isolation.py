@@ -51,6 +51,8 @@ from eitbench.bench.methods import (
     is_builtin,
     is_path,
     load_method,
+    method_files,
+    method_sha256,
 )
 from eitbench.bench.tracks import SUBTRACKS, Environment, is_measured
 from eitbench.data.cache import CACHE_VARIABLE, cache_folder, model_key
@@ -259,7 +261,7 @@ def load_isolated(track: str, id: str, kwargs: str, method: str, isolation: str)
             raise ValueError(f"{path} is privileged: it needs the ground truth")
         key = (track, id, kwargs, method, loaded.sha256, isolation)
         return loaded._replace(make=_RemoteClass(key, loaded.suits))
-    sha256 = hashlib.sha256(path.read_bytes()).hexdigest()
+    sha256 = method_sha256(method_files(path))
     return _load((track, id, kwargs, method, sha256, isolation), path)
 
 
@@ -442,13 +444,10 @@ class Worker:
         if is_path(method) and is_builtin(method):
             contents["method"] = str(Path(method).resolve()).encode()
         elif is_path(method):
-            path = Path(method)
-            beside = ("config.json", "sha256") if path.suffix == ".zip" else ()
-            for each in (path, *(path.with_name(name) for name in beside)):
-                if each.exists():
-                    contents[f"file:{each.name}"] = each.read_bytes()
-            contents["method"] = path.name.encode()
-            self.sha256 = hashlib.sha256(contents[f"file:{path.name}"]).hexdigest()
+            files = method_files(Path(method))
+            contents |= {f"file:{name}": content for name, content in files.items()}
+            contents["method"] = Path(method).name.encode()
+            self.sha256 = method_sha256(files)
         return {name: np.frombuffer(content, np.uint8) for name, content in contents.items()}
 
     def _ask(self, do: str, arrays: Arrays | None = None, **header: Any,

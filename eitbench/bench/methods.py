@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import hashlib
 import importlib.util
 import json
@@ -29,6 +30,8 @@ and content."""
 ROLES = (None, "floor", "reference")
 """Role of a method on a board: ranked, naive baseline, or oracle."""
 
+AGENT_FILES = ("config.json", "sha256")
+"""Files beside the model.zip of an agent."""
 MAX_METHOD_BYTES = 1 << 28
 """of a method's file, which is read whole"""
 MAX_TITLE_CHARS = 120
@@ -202,6 +205,58 @@ def golden_version(name: str) -> int:
     return int(json.loads(path.read_text(encoding="utf-8"))["version"])
 
 
+def method_files(path: Path) -> dict[str, bytes]:
+    """Map the name of a method's file, first, and of each file beside it that the method needs to
+    its content: what the class names in ``files = ("weights.npz",)``, and what `eitbench.rl.save_agent`
+    wrote beside a model. The source is parsed, not executed. ``ValueError`` if a named file is
+    missing, or lies elsewhere."""
+    source = path.read_bytes()
+    if path.suffix != ".py":
+        return {path.name: source} | {name: path.with_name(name).read_bytes()
+                                      for name in AGENT_FILES if path.with_name(name).is_file()}
+    contents = {path.name: source}
+    for name in _named_files(path, source):
+        file = path.with_name(name) if name == Path(name).name else Path()
+        if not file.is_file():
+            raise ValueError(f"{path}: files must name files in the folder of the method, got "
+                             f"{name!r}")
+        if file.stat().st_size > MAX_METHOD_BYTES:
+            raise ValueError(f"{file} must have {MAX_METHOD_BYTES >> 20} MiB at most")
+        contents[name] = file.read_bytes()
+    return contents
+
+
+def _named_files(path: Path, source: bytes) -> tuple[str, ...]:
+    """Return the literal ``files`` of the class `Estimator` or `Policy`; empty without one."""
+    try:
+        tree = ast.parse(source)
+    except (SyntaxError, ValueError):
+        return ()                   # loading reports the error
+    types = {kind.type for kind in METHOD_KINDS.values()}
+    for statement in (each for node in tree.body if isinstance(node, ast.ClassDef)
+                      and node.name in types for each in node.body):
+        if isinstance(statement, ast.Assign) and ast.unparse(statement.targets[0]) == "files":
+            try:
+                names = ast.literal_eval(statement.value)
+            except ValueError:
+                names = None
+            if not isinstance(names, tuple) or not all(isinstance(each, str) for each in names):
+                raise ValueError(f"{path}: files must be a tuple of names of files, got "
+                                 f"{ast.unparse(statement.value)}")
+            return names
+    return ()
+
+
+def method_sha256(contents: Mapping[str, bytes]) -> str:
+    """Return the sha256 of a method from its `method_files`: that of its file, or of the list of
+    all names and digests if its class names files."""
+    (name, source), *others = contents.items()
+    if not others or not name.endswith(".py"):
+        return hashlib.sha256(source).hexdigest()
+    lines = [f"{name} {hashlib.sha256(content).hexdigest()}\n" for name, content in contents.items()]
+    return hashlib.sha256("".join(lines).encode()).hexdigest()
+
+
 def find_method(name: str, track: str) -> Path:
     """Return the file of a method by its name, if it is built in or installed, or by its path.
     ``ValueError`` if there is none, or it has the name of another."""
@@ -232,13 +287,13 @@ def load_method(name: str, track: str) -> Method:
     ``ValueError`` if there is none, its file has no class as its track requires, or an agent's file
     is not the one that its training wrote."""
     path = find_method(name, track)
-    return _load(path, path.read_bytes(), track)
+    contents = method_files(path)
+    return _load(path, contents[path.name], method_sha256(contents), track)
 
 
 @lru_cache(maxsize=64)
-def _load(path: Path, source: bytes, track: str) -> Method:
+def _load(path: Path, source: bytes, sha256: str, track: str) -> Method:
     """Load the file with this content, which is executed once a process."""
-    sha256 = hashlib.sha256(source).hexdigest()
     form = METHOD_KINDS[track]
     if track == "injection" and path.suffix in _loaders():
         name, title, agent, parameters = _loaders()[path.suffix].load()(path, source)

@@ -20,7 +20,15 @@ from tqdm import tqdm
 from eitbench._sanitize import error_location, user_traceback
 from eitbench.bench import isolation
 from eitbench.bench.isolation import WorkerError, load_isolated
-from eitbench.bench.methods import Method, find_method, load_method, loader_of, version_of
+from eitbench.bench.methods import (
+    Method,
+    find_method,
+    load_method,
+    loader_of,
+    method_files,
+    method_sha256,
+    version_of,
+)
 from eitbench.bench.records import COMMON_FIELDS
 from eitbench.bench.runner import cached_environment, run_method
 from eitbench.bench.scores import SCORING, compute_scores
@@ -62,15 +70,15 @@ class Job(NamedTuple):
         stored result counts only for the very same. The method is not loaded. ``ValueError`` if
         there is no such method or environment."""
         path = find_method(self.method, self.environment.track)
-        files = {each.name: hashlib.sha256(each.read_bytes()).hexdigest()
-                 for each in (path, path.with_name("config.json"))
-                 if each == path or (path.suffix != ".py" and each.is_file())}
+        contents = method_files(path)
+        files = {name: hashlib.sha256(content).hexdigest() for name, content in contents.items()
+                 if name != "sha256"}
         arguments = self.environment.arguments
         world = arguments.pop("world", None)
         parts = {"environment": self.environment.id, "arguments": arguments,
                  "world": _content_digest(self.environment.id, world), "files": files,
                  "loader": loader_of(path),
-                 "version": version_of(path, files[path.name]), "seed": self.seed,
+                 "version": version_of(path, method_sha256(contents)), "seed": self.seed,
                  "scoring": SCORING}
         return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()[:16]
 

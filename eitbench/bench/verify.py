@@ -3,7 +3,6 @@ the scores."""
 
 from __future__ import annotations
 
-import hashlib
 import json
 from collections.abc import Sequence
 from pathlib import Path
@@ -23,6 +22,8 @@ from eitbench.bench.methods import (
     installed_methods,
     is_builtin,
     is_path,
+    method_files,
+    method_sha256,
 )
 from eitbench.bench.records import (
     COMMON_FIELDS,
@@ -173,7 +174,7 @@ def job_for_record(record: dict[str, Any], file: str | None = None, isolate: str
     if is_builtin(method) and not (built_in and path.samefile(built_in)):
         raise ValueError(f"{path} is a built-in method, but not {record['method']}, as the record "
                          "says")
-    sha256 = hashlib.sha256(path.read_bytes()).hexdigest()
+    sha256 = method_sha256(method_files(path))
     if sha256 != record["method_sha256"] and not is_builtin(method):
         raise ValueError(f"the sha256 of {path.name} is {sha256}, but that of the record "
                          f"{record['method_sha256']}")
@@ -193,9 +194,11 @@ def _known(record: dict[str, Any]) -> str | None:
 def _submitted(record: dict[str, Any], folder: Path | None) -> str | None:
     """Return the file in a folder, or below, that has the record's sha256."""
     for path in sorted(folder.rglob("*")) if folder else []:
-        if (is_path(path.name) and path.is_file() and not path.is_symlink()
-                and hashlib.sha256(path.read_bytes()).hexdigest() == record["method_sha256"]):
-            return str(path)
+        if not is_path(path.name) or not path.is_file() or path.is_symlink():
+            continue
+        with suppress(ValueError):              # a file that another method lacks
+            if method_sha256(method_files(path)) == record["method_sha256"]:
+                return str(path)
     return None
 
 

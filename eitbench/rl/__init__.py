@@ -1,1 +1,5 @@
-"""Floor 8: learning to choose injections (extra ``rl``)."""
+"""Learning to choose injections (extra ``rl``), and policies of trained agents."""
+
+from eitbench.rl.agents import AgentPolicy, save_agent
+
+__all__ = ["AgentPolicy", "save_agent"]

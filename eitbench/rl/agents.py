@@ -10,19 +10,60 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from eitbench._files import write_atomically
 from eitbench.bench.methods import baseline_folder
 from eitbench.envs.injection_core import InjectionCore, flatten_scaled
-from eitbench.estimation.onboard.onboard_filter import OnboardFilter
-from eitbench.estimation.onboard.reduced_filters import ReducedFilters
+from eitbench.estimation.onboard.onboard_filter import OnboardFilter, filters_class
 from eitbench.estimation.onboard.rules import Rules
+from eitbench.worlds.registry import entry
 
 
-class Agent:
-    """A policy with the deterministic actions of a stable-baselines3 model, which subclasses set.
+class AgentPolicy:
+    """Base class of policies that observe what an agent observed in training.
 
-    The agent observes the reduced filter with which it was trained, whichever filter the
-    environment has, so its injections do not depend on that filter.
+    A scored run gives a policy a raw observation, with the estimates of the full filter. `act`
+    replaces it by the scaled observation (d,) float32 of the environment in which the agent was
+    trained, with its filter, and passes it to `choose`, which subclasses define. Injections so do
+    not depend on the filter of the environment.
+
+    Parameters
+    ----------
+    rules : Rules
+    random : numpy.random.Generator
+        For policies that draw actions.
     """
+
+    estimator: ClassVar[str] = "reduced"
+    """Filter of the environment in which the agent was trained: "reduced" or "full"."""
+
+    def __init__(self, rules: Rules, random: np.random.Generator) -> None:
+        self.rules = rules
+        self.random = random
+        self._onboard: OnboardFilter | None = None
+
+    def choose(self, observation: np.ndarray, mask: np.ndarray) -> Any:
+        """Return the action for a scaled observation (d,); ``mask`` (n,) bool marks the allowed
+        ones of n numbered actions (empty if actions are currents)."""
+        raise NotImplementedError
+
+    def act(self, observation: dict[str, np.ndarray]) -> Any:
+        """Return the action for a raw observation."""
+        if self._onboard is None:
+            kind = filters_class(self.rules, self.estimator)
+            assert kind is not None
+            self._onboard = OnboardFilter(kind, self.rules, observation["frame"][None])
+        else:
+            self._onboard.assimilate(observation["voltages"][None], observation["currents"][None])
+        features = self._onboard.features()
+        observation = observation | {name: array[0] for name, array in features.items()}
+        n = getattr(self.rules.action_space, "n", 0)
+        is_spent = self.rules.budget is not None and observation["left"][1] == 0.0
+        return self.choose(flatten_scaled(self.rules, observation),
+                           np.arange(n) >= is_spent * (n - 1))
+
+
+class _ModelPolicy(AgentPolicy):
+    """Policy of the deterministic actions of a stable-baselines3 model, which subclasses set."""
 
     model: ClassVar[Any]
     uses_action_masks: ClassVar[bool]
@@ -30,35 +71,75 @@ class Agent:
     @classmethod
     def suits(cls, rules: Rules) -> bool:
         """Return whether spaces have the shapes with which the model was trained."""
-        core = InjectionCore(rules, "reduced", "scaled")
+        core = InjectionCore(rules, cls.estimator, "scaled")
         return bool(cls.model.action_space == core.action_space
                     and cls.model.observation_space.shape == core.observation_space.shape)
 
     def __init__(self, rules: Rules, random: np.random.Generator) -> None:
-        self.rules = rules
-        self.hidden_state = None
-        self.onboard: OnboardFilter | None = None
+        super().__init__(rules, random)
+        self._hidden_state = None
+        self._is_first = True
 
-    def act(self, observation: dict[str, np.ndarray]) -> Any:
-        begins = self.onboard is None
-        if self.onboard is None:
-            self.onboard = OnboardFilter(ReducedFilters, self.rules, observation["frame"][None])
-        else:
-            self.onboard.assimilate(observation["voltages"][None], observation["currents"][None])
-        features = self.onboard.features()
-        observation = observation | {name: array[0] for name, array in features.items()}
-        masks = {}
-        if self.uses_action_masks:
-            spent = self.rules.budget is not None and observation["left"][1] == 0.0
-            n = self.model.action_space.n
-            masks["action_masks"] = np.arange(n) >= spent * (n - 1)
-        action, self.hidden_state = self.model.predict(
-            flatten_scaled(self.rules, observation), state=self.hidden_state,
-            episode_start=np.array([begins]), deterministic=True, **masks)
+    def choose(self, observation: np.ndarray, mask: np.ndarray) -> Any:
+        masks = {"action_masks": mask} if self.uses_action_masks else {}
+        action, self._hidden_state = self.model.predict(
+            observation, state=self._hidden_state, episode_start=np.array([self._is_first]),
+            deterministic=True, **masks)
+        self._is_first = False
         return action
 
 
-def load_agent(path: Path, content: bytes) -> tuple[str, str, type[Agent], dict[str, Any]]:
+def save_agent(model: Any, env: Any, folder: str | Path) -> Path:
+    """Write a trained stable-baselines3 model as an agent, for ``eitbench run --policy`` and
+    ``submit``; return the path of its ``model.zip``.
+
+    Parameters
+    ----------
+    model : BaseAlgorithm
+        Of a class in `eitbench.rl.training.ALGORITHMS`: PPO, DQN, SAC, RecurrentPPO, MaskablePPO.
+    env : str or environment
+        Id of the injection environment, or the Gymnasium (vector) environment in which the model
+        was trained, with its arguments.
+    folder : str or Path
+        Gets ``model.zip``, ``config.json`` and ``sha256``, the digest of the model.
+
+    Raises
+    ------
+    ValueError
+        If the model is of another class, or was not trained with scaled observations and actions
+        of this environment.
+    """
+    import gymnasium as gym
+
+    from eitbench.rl.training import ALGORITHMS, save_model
+    algo = next((name for name, each in ALGORITHMS.items() if type(model) is each), None)
+    if algo is None:
+        raise ValueError("model must be of one of the classes "
+                         f"{', '.join(each.__name__ for each in ALGORITHMS.values())}, got "
+                         f"{type(model).__name__}; for others write a policy file with AgentPolicy")
+    spec = gym.spec(env) if isinstance(env, str) else getattr(env, "spec", None)
+    if spec is None or entry(spec.id).track != "injection":
+        raise ValueError("env must be the id of an injection environment, or such an environment "
+                         f"of gym.make or gym.make_vec, got {env!r}")
+    kwargs = {name: value for name, value in spec.kwargs.items()
+              if name in ("variant", "world", "gate", "inflow", "estimator")}
+    core: Any = gym.make(spec.id, disable_env_checker=True, **kwargs).unwrapped
+    for name in ("observation_space", "action_space"):
+        expected, got = getattr(core, name), getattr(model, name)
+        if (expected.shape, getattr(expected, "n", 0)) != (got.shape, getattr(got, "n", 0)):
+            raise ValueError(f"model must have the {name} of {spec.id} with scaled observations, "
+                             f"{expected}, got {got}")
+    folder = Path(folder)
+    settings = {"env": spec.id, "kwargs": kwargs, "algo": algo, "seed": model.seed or 0,
+                "config": {"total_steps": int(model.num_timesteps)}}
+    path = folder / "model.zip"
+    save_model(model, path)
+    write_atomically(folder / "config.json", json.dumps(settings, indent=1).encode())
+    write_atomically(folder / "sha256", hashlib.sha256(path.read_bytes()).hexdigest().encode())
+    return path
+
+
+def load_agent(path: Path, content: bytes) -> tuple[str, str, type[AgentPolicy], dict[str, Any]]:
     """Return name, title, policy and parameters of the model.zip at ``path`` with this ``content``.
 
     The name is ALGO_seedK for built-in agents, and ALGO_HASH_seedK, with a hash of the
@@ -71,7 +152,8 @@ def load_agent(path: Path, content: bytes) -> tuple[str, str, type[Agent], dict[
         expected = (path.parent / "sha256").read_text().split()[0]
     except (OSError, ValueError, IndexError) as error:
         raise ValueError(f"policy {path} must be in a folder with the config.json and sha256 that "
-                         f"`eitbench train` writes: {error}") from None
+                         "`eitbench train` and eitbench.rl.save_agent(model, env, folder) write: "
+                         f"{error}") from None
     found = hashlib.sha256(content).hexdigest()
     if found != expected:
         raise ValueError(f"policy {path} must have the sha256 of its folder, {expected}, got "
@@ -79,8 +161,9 @@ def load_agent(path: Path, content: bytes) -> tuple[str, str, type[Agent], dict[
     from eitbench.rl.training import ALGORITHMS
     algo, seed = asked["algo"], asked["seed"]
     model = ALGORITHMS[algo].load(io.BytesIO(content), device="cpu")
-    policy = type("Policy", (Agent,), {"model": model,
-                                       "uses_action_masks": algo.startswith("maskable")})
+    policy = type("Policy", (_ModelPolicy,), {
+        "model": model, "uses_action_masks": algo.startswith("maskable"),
+        "estimator": asked.get("kwargs", {}).get("estimator", "reduced")})
     built_in = (baseline_folder() / "checkpoints" / asked["env"].replace("/", "-") / algo
                 / f"seed{seed}" / "sha256")             # a copy elsewhere is built-in too
     is_built_in = built_in.is_file() and built_in.read_text().split()[:1] == [found]

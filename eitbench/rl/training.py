@@ -187,7 +187,7 @@ def train(env: str, algo: str, config: TrainingConfig, seed: int, folder: Path,
     if is_new:
         if config.imitate:
             imitate(model, world, config.imitate, config.reward_scale, inner.reference, seed)
-        _save(model, latest)
+        save_model(model, latest)
     callback = _Checkpoints(folder, config.interval, make_evaluator(env, kwargs, config))
     if not (folder / "evaluations.npz").exists():
         callback.evaluate(model)
@@ -195,7 +195,7 @@ def train(env: str, algo: str, config: TrainingConfig, seed: int, folder: Path,
         model.learn(left, callback=callback, reset_num_timesteps=False, tb_log_name="run",
                     progress_bar=sys.stderr.isatty())
     _clear_optimisers(model)
-    _save(model, made)
+    save_model(model, made)
     write_atomically(folder / "sha256", hashlib.sha256(made.read_bytes()).hexdigest().encode())
     latest.unlink()
     (folder / "reference.npy").unlink(missing_ok=True)
@@ -291,8 +291,8 @@ def _new_model(algo: str, config: TrainingConfig, learning: VecEnv, seed: int,
         raise ValueError(f"algorithm must hold valid arguments of {algo}: {error}") from None
 
 
-def _save(model: BaseAlgorithm, path: Path) -> None:
-    """Write the model as a compressed zip, atomically; stable-baselines3 compresses nothing."""
+def save_model(model: BaseAlgorithm, path: Path) -> None:
+    """Write a model as a compressed zip, atomically; stable-baselines3 compresses nothing."""
     stored, content = io.BytesIO(), io.BytesIO()
     model.save(stored)
     with zipfile.ZipFile(stored) as source, zipfile.ZipFile(content, "w") as packed:
@@ -330,7 +330,7 @@ class _Checkpoints(BaseCallback):
 
     def _on_training_end(self) -> None:
         self.logger.record("eval/relative_error", float(self.evaluate(self.model).mean()))
-        _save(self.model, self.folder / "latest.zip")
+        save_model(self.model, self.folder / "latest.zip")
 
     def evaluate(self, model: BaseAlgorithm) -> np.ndarray:
         """Append the errors (episodes,) to the table, in which they replace those after as many
