@@ -51,7 +51,7 @@ def to_the_end(env, actions):
 
 
 def assert_equal(these, those):
-    """Equal but for rounding: a copy's arrays may be aligned otherwise in memory, and BLAS then adds in another order."""
+    """Equal up to rounding: the arrays of a copy may be aligned differently, and BLAS then sums in another order."""
     assert len(these) == len(those)
     for a, b in zip(these, those, strict=True):
         if isinstance(a, dict):
