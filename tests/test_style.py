@@ -9,14 +9,14 @@ import pytest
 
 ROOT = Path(__file__).parent.parent
 PACKAGE = ROOT / "eitbench"
-BUDGETS = {"numerics": 1580, "scoring": 110, "physics": 1420, "worlds": 2700, "data": 1515, "estimation": 5800,
-           "measured": 1770, "envs": 1630, "bench": 5050, "report": 3077, "rl": 725, "cli": 950}
+BUDGETS = {"numerics": 1580, "scoring": 110, "physics": 1420, "worlds": 2700, "data": 1525, "estimation": 5810,
+           "measured": 1900, "envs": 1660, "bench": 5110, "report": 3140, "rl": 725, "cli": 975}
 """Package (or module) -> lines of Python allowed, blank lines and docstrings included. Each imports only from those
 before it."""
 TOP = 430
 """Lines allowed in the other modules at the top: public names, argument checks, files, messages."""
-BASELINES = 2040
-TESTS = 20_060
+BASELINES = 2045
+TESTS = 20_230
 MODULES = {".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__"): path
            for path in PACKAGE.rglob("*.py")}
 
