@@ -45,7 +45,7 @@ _LAZY_NAMES = {"Estimate": "worlds.task", "Task": "worlds.task", "make_task": "w
                "dataset": "data.dataset", "Rules": "estimation.onboard.rules",
                "describe_environment": "envs.env_docs", "evaluate": "bench.evaluation"}
 """Public name -> the module that is imported on its first use."""
-_LAZY_MODULES = {"leaderboard": "bench", "plot": "report.plot"}
+_LAZY_MODULES = {"leaderboard": "bench", "plot": "report.plot", "rl": "rl"}
 
 
 def __getattr__(name: str) -> Any:

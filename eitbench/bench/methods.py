@@ -206,10 +206,10 @@ def golden_version(name: str) -> int:
 
 
 def method_files(path: Path) -> dict[str, bytes]:
-    """Map the name of a method's file, first, and of each file beside it that the method needs to
-    its content: what the class names in ``files = ("weights.npz",)``, and what `eitbench.rl.save_agent`
-    wrote beside a model. The source is parsed, not executed. ``ValueError`` if a named file is
-    missing, or lies elsewhere."""
+    """Map names to contents of the files of a method: its own, first, those that its class names in
+    ``files = ("weights.npz",)``, and those that `eitbench.rl.save_agent` writes with a model.
+
+    The source is parsed, not executed. ``ValueError`` if a named file is not in the folder."""
     source = path.read_bytes()
     if path.suffix != ".py":
         return {path.name: source} | {name: path.with_name(name).read_bytes()
@@ -253,7 +253,8 @@ def method_sha256(contents: Mapping[str, bytes]) -> str:
     (name, source), *others = contents.items()
     if not others or not name.endswith(".py"):
         return hashlib.sha256(source).hexdigest()
-    lines = [f"{name} {hashlib.sha256(content).hexdigest()}\n" for name, content in contents.items()]
+    lines = [f"{each} {hashlib.sha256(content).hexdigest()}\n"
+             for each, content in contents.items()]
     return hashlib.sha256("".join(lines).encode()).hexdigest()
 
 

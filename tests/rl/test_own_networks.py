@@ -1,0 +1,173 @@
+"""Networks trained elsewhere, as agents, policies and estimators: from weights to a record."""
+
+import json
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch
+from eitbench.bench.isolation import close, load_isolated
+from eitbench.bench.methods import load_method
+from eitbench.bench.records import read_record
+from eitbench.bench.store import EpisodeStore
+from eitbench.bench.submit import submit
+from eitbench.data.seeds import parse_seeds
+from eitbench.rl import save_agent
+from sb3_contrib import TRPO
+from stable_baselines3 import PPO
+
+from short import PIPE, shorten
+from tiny import git_says
+
+NAME, FILTER = "eitbench/Pipe2DInjection-v0", "eitbench/Pipe2D-v0"
+SHORT = {"world": PIPE}
+POLICY = '''"""A network in the style of CleanRL."""
+from pathlib import Path
+
+import torch
+from eitbench.rl import AgentPolicy
+
+
+class Policy(AgentPolicy):
+    files = ("agent.pt",)
+
+    def __init__(self, rules, random):
+        super().__init__(rules, random)
+        weights = torch.load(Path(__file__).with_name("agent.pt"), weights_only=True)
+        n, d = weights["weight"].shape
+        self.actor = torch.nn.Linear(d, n)
+        self.actor.load_state_dict(weights)
+
+    def choose(self, observation, mask):
+        with torch.no_grad():
+            logits = self.actor(torch.as_tensor(observation))
+        return int(logits.masked_fill(~torch.as_tensor(mask), -torch.inf).argmax())
+'''
+ESTIMATOR = '''"""A network as an estimator."""
+from pathlib import Path
+
+import torch
+from eitbench import Estimate
+
+
+class Estimator:
+    files = ("weights.pt",)
+
+    def __init__(self, task):
+        self.weights = torch.load(Path(__file__).with_name("weights.pt"), weights_only=True)
+
+    def update(self, voltages, currents):
+        return Estimate((self.weights["matrix"] @ torch.as_tensor(voltages)).numpy())
+'''
+
+
+@pytest.fixture(autouse=True)
+def short_episodes(monkeypatch, tmp_path):
+    """Make the episodes of the registered environments short, and submit from a clean commit."""
+    git_says(monkeypatch, "c0ffee")
+    shorten(monkeypatch, {FILTER: PIPE, NAME: PIPE})
+    monkeypatch.chdir(tmp_path)
+
+
+def assert_submits(method, id, tmp_path):
+    """A record of one test episode that finished."""
+    (path,) = submit(str(method), [id], parse_seeds("test:0"), EpisodeStore(tmp_path / "results"), tmp_path / "to",
+                     policy=id == NAME, isolate="none")
+    record = read_record(path)
+    assert [each["status"] for each in record["episodes"]] == ["ok"]
+    return record
+
+
+def rollout(method, **kwargs):
+    """Actions of a method in an episode, and the scaled observations of the same environment."""
+    raw = gym.make(NAME, observation="raw", **SHORT, **kwargs)
+    scaled = gym.make(NAME, **SHORT, **kwargs)
+    observation, _ = raw.reset(seed=3)
+    seen = [scaled.reset(seed=3)[0]]
+    policy, actions, ended = method.make(raw.unwrapped.rules, np.random.default_rng(0)), [], False
+    while not ended:
+        actions.append(policy.act(observation))
+        observation, _, ended, _, _ = raw.step(actions[-1])
+        seen.append(scaled.step(actions[-1])[0])
+    return actions, seen[:-1]
+
+
+@pytest.mark.parametrize("estimator", ["reduced", "full"])
+def test_a_model_of_stable_baselines3_is_an_agent(estimator, tmp_path):
+    """Its actions are those for the observations of training, with the filter of training; it can be submitted."""
+    env = gym.make(NAME, estimator=estimator, **SHORT)
+    model = PPO("MlpPolicy", env, seed=4, n_steps=8, batch_size=8).learn(16)
+    path = save_agent(model, env, tmp_path / "agent")
+    method = load_method(str(path), "injection")
+    assert method.name.startswith("ppo_") and method.parameters == {"env": NAME, "total_steps": 16}
+    for kwargs in ({"estimator": estimator}, {"estimator": "full"}):
+        actions, seen = rollout(method, **kwargs)
+        if kwargs["estimator"] == estimator:
+            assert [int(each) for each in actions] == [int(model.predict(each, deterministic=True)[0])
+                                                       for each in seen]
+    assert assert_submits(path, NAME, tmp_path)["method"] == method.name
+
+
+def test_what_is_no_agent_is_refused(tmp_path):
+    """Before anything is written: another class, another environment, other observations."""
+    env = gym.make(NAME, **SHORT)
+    model = PPO("MlpPolicy", env)
+    for each, place, message in [
+            (TRPO("MlpPolicy", env), env, "model must be of one of the classes PPO, .*got TRPO"),
+            (model, FILTER, "env must be the id of an injection environment"),
+            (model, gym.make("CartPole-v1"), "env must be one of eitbench/"),
+            (PPO("MlpPolicy", gym.make("CartPole-v1")), NAME, "model must have the observation_space of")]:
+        with pytest.raises(ValueError, match=message):
+            save_agent(each, place, tmp_path / "agent")
+    assert not (tmp_path / "agent").exists()
+    model.save(tmp_path / "model.zip")
+    with pytest.raises(ValueError, match="save_agent"):
+        load_method(str(tmp_path / "model.zip"), "injection")
+
+
+@pytest.fixture
+def policy(tmp_path):
+    env = gym.make(NAME, **SHORT)
+    torch.manual_seed(0)
+    torch.save(torch.nn.Linear(env.observation_space.shape[0], env.action_space.n).state_dict(), tmp_path / "agent.pt")
+    (tmp_path / "mine.py").write_text(POLICY)
+    return tmp_path / "mine.py"
+
+
+def test_a_policy_reads_the_files_that_its_class_names(policy, tmp_path):
+    """It chooses as the network does for scaled observations, in a worker too, whose folder holds the file."""
+    method = load_method(str(policy), "injection")
+    actions, seen = rollout(method)
+    weights = torch.load(tmp_path / "agent.pt", weights_only=True)
+    logits = torch.as_tensor(np.array(seen)) @ weights["weight"].T + weights["bias"]
+    assert actions == logits.argmax(1).tolist()
+    try:
+        isolated = load_isolated("injection", NAME, json.dumps(SHORT), str(policy), "process")
+        assert isolated.sha256 == method.sha256 and rollout(isolated)[0] == actions
+    finally:
+        close()
+    assert assert_submits(policy, NAME, tmp_path)["method_sha256"] == method.sha256
+
+
+def test_a_method_is_its_file_and_the_files_it_names(policy, tmp_path):
+    """Other weights are another version; a file that is missing or lies elsewhere is named."""
+    before = load_method(str(policy), "injection").sha256
+    weights = torch.load(tmp_path / "agent.pt", weights_only=True)
+    torch.save({name: 2 * value for name, value in weights.items()}, tmp_path / "agent.pt")
+    assert load_method(str(policy), "injection").sha256 != before
+    for text, message in [('("agent.pt", "other.npz")', "files must name files in the folder of the method, got 'oth"),
+                          ('("../agent.pt",)', "files must name files in the folder"),
+                          ('"agent.pt"', "files must be a tuple of names")]:
+        policy.write_text(POLICY.replace('("agent.pt",)', text))
+        with pytest.raises(ValueError, match=message):
+            load_method(str(policy), "injection")
+
+
+def test_a_torch_estimator_reads_its_weights(tmp_path):
+    """From weights to a record."""
+    env = gym.make(FILTER, **SHORT)
+    shape = env.action_space.shape[0], env.observation_space["voltages"].shape[0]
+    matrix = torch.full(shape, 1e-3, dtype=torch.float64)
+    torch.save({"matrix": matrix}, tmp_path / "weights.pt")
+    (tmp_path / "network.py").write_text(ESTIMATOR)
+    assert_submits(tmp_path / "network.py", FILTER, tmp_path)
