@@ -208,7 +208,7 @@ def compare(
 
 @app.command()
 def render(
-    env: Annotated[str, typer.Option(help="Environment id.")] = "eitbench/Pipe2D-v0",
+    env: options.EnvironmentId = "eitbench/Pipe2D-v0",
     baseline: Annotated[list[str] | None, typer.Option(
         help="Name of one of ours, or a .py file; repeatable. Default: kalman_filter.")] = None,
     policy: Annotated[str | None, typer.Option(

@@ -19,7 +19,7 @@ fit = typer.Typer(no_args_is_help=True, help="Fit priors and models to training 
 
 
 def bank(
-    env: Annotated[str, typer.Option(help="Environment id.")] = "eitbench/Pipe2D-v0",
+    env: options.EnvironmentId = "eitbench/Pipe2D-v0",
     seeds: Annotated[str, typer.Option(help="Episodes, such as train:0-999.")] = "train:0-99",
     jobs: options.Jobs = options.CORES,
     backend: options.Backends = options.Backend.loky,
@@ -59,8 +59,7 @@ def export(
     out: Annotated[str, typer.Option(
         "--out", "-o", help="Folder of the files; for minari the name of the data set, such as "
                             "eitbench/pipe2d/random-pair-v0.")],
-    env: Annotated[str, typer.Option(
-        help="Environment id; for minari of an injection environment.")] = "eitbench/Pipe2D-v0",
+    env: options.EnvironmentId = "eitbench/Pipe2D-v0",
     seeds: Annotated[str, typer.Option(help="Episodes, such as train:0-999.")] = "train:0-99",
     format: Annotated[Format, typer.Option(
         help="File format; hdf5 needs the extra export, minari the extra minari.")] = Format.npz,
@@ -95,7 +94,7 @@ def export(
 
 
 def train(
-    env: options.InjectionId,
+    env: options.EnvironmentId,
     algo: Annotated[Algorithm, typer.Option(
         help="Algorithm of stable-baselines3 or sb3-contrib.")] = Algorithm.ppo,
     config: Annotated[Path, typer.Option(
@@ -125,7 +124,7 @@ def train(
 
 @fit.command("prior")
 def fit_prior(
-    env: Annotated[str, typer.Option(help="Id of an environment whose world has an inflow.")],
+    env: options.EnvironmentId,
     out: Annotated[Path, typer.Option("--out", "-o", help="File to write, JSON.")],
     seeds: Annotated[str, typer.Option(help="Episodes of the split train.")] = "train:0-199",
     link: Annotated[Link, typer.Option(
@@ -161,7 +160,7 @@ def fit_prior(
 
 @fit.command("model")
 def fit_model(
-    env: Annotated[str, typer.Option(help="Id of an environment whose world has an inflow.")],
+    env: options.EnvironmentId,
     out: Annotated[Path, typer.Option("--out", "-o", help="File to write, npz.")],
     seeds: Annotated[str, typer.Option(help="Episodes of the split train.")] = "train:0-199",
     modes: Annotated[int, typer.Option(

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import importlib
 import os
+import sys
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
 
+import cloudpickle
 import typer
 
 from eitbench._extras import missing_extra
@@ -26,6 +29,26 @@ def resolve_path(path: Path | None) -> Path | None:
     return path and resolve_input(path)
 
 
+def import_env(env: str | list[str] | None) -> str | list[str] | None:
+    """Import the modules of ids such as ``module:namespace/Name-v0``, also from the working
+    directory, and return the ids alone."""
+    if isinstance(env, list):
+        return [str(import_env(each)) for each in env]
+    module, separator, id = (env or "").rpartition(":")
+    if not separator:
+        return env
+    sys.path.insert(0, os.getcwd())
+    try:
+        cloudpickle.register_pickle_by_value(importlib.import_module(module))   # for workers
+    except Exception as error:
+        raise typer.BadParameter(f"module {module} of {env} cannot be imported: "
+                                 f"{type(error).__name__}: {error}") from error
+    finally:
+        sys.path.remove(os.getcwd())
+    return id
+
+
+_ENV_HELP = "id; module:id imports a module first, which registers it."
 Out = Annotated[Path, typer.Option("--out", "-o", help="Folder of the results.")]
 Jobs = Annotated[int, typer.Option(
     "--jobs", "-j", min=1, help="Processes; each takes a core and 1 to 4 GB.")]
@@ -37,8 +60,10 @@ Isolate = Annotated[Isolation, typer.Option(
          "separate one that reads no files, truths or network. auto: built-in methods in this "
          "process; a third-party file in a separate one, which for official runs and verification "
          "must be confined by bubblewrap.")]
-Environments = Annotated[list[str] | None, typer.Option(help="Environment id; may be repeated.")]
-InjectionId = Annotated[str, typer.Option(help="Id of an injection environment.")]
+Environments = Annotated[list[str] | None, typer.Option(
+    help=f"Environment {_ENV_HELP} May be repeated.", callback=import_env)]
+EnvironmentId = Annotated[str, typer.Option(
+    "--env", help=f"Environment {_ENV_HELP}", callback=import_env)]
 Records = Annotated[Path, typer.Option(
     help="Folder of the records. Where there is none, those that come with the package.",
     callback=resolve_path)]
