@@ -68,7 +68,7 @@ def environments() -> Files:
             parts.append(f"![An episode of {id}, in motion]({media.name})")
         parts.append(f'```python\nenv = gym.make("{id}")\n```')
         parts.append(linked(eitbench.describe_environment(id)))
-        board = [row for row in rows if row["environment"] == slug]
+        board = [row for row in rows if row["environment"] == id]
         if board:
             parts.append(f"## Scores\n\n{table(board, 'method')}\n\n[The whole board, with "
                          f"intervals and pictures](../boards/environments/{slug}.html)")
@@ -129,7 +129,7 @@ def table(rows: list[dict[str, str]], first: str) -> str:
 def name_of(row: dict[str, str], first: str) -> str:
     """A line's name with a link to its page."""
     if first == "environment":
-        name = row["environment"].removeprefix("eitbench-")
+        name = row["environment"].removeprefix("eitbench/")
         return f"[{name}](../environments/{name}.md)"
     if re.search(r"_seed\d+$", row["method"]):
         return f"[{row['title']}](../injection.md#trained-agents)"

@@ -58,7 +58,8 @@ def load(folder: Path | str | None = None, *, measured: bool = False) -> pd.Data
 
 
 def _rows(record: dict[str, Any], outdated: bool) -> Iterator[tuple[Any, ...]]:
-    fields = record | {"environment": record["environment"]["name"], "outdated": outdated}
+    from eitbench.bench.tracks import qualified_name
+    fields = record | {"environment": qualified_name(record["environment"]), "outdated": outdated}
     first = tuple(fields[name] for name in _COLUMNS[:10])
     for episode in record["episodes"]:
         scores = {"error": math.nan}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections.abc import Mapping
 from inspect import Parameter, signature
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -150,6 +151,12 @@ def environment_name(id: str, given: dict[str, Any]) -> str:
     text = json.dumps(given, sort_keys=True)
     digest = hashlib.sha256(text.encode()).hexdigest()[:8]
     return id.replace("/", "-") + (f"-{digest}" if given else "")
+
+
+def qualified_name(environment: Mapping[str, Any]) -> str:
+    """Return the id of a record's environment, with the suffix of its name where arguments differ
+    from the registered ones."""
+    return str(environment["id"] + environment["name"][len(environment["id"]):])
 
 
 def record_name(environment: str, method: str, version: str, split: str) -> str:

@@ -28,7 +28,7 @@ from eitbench.bench.statistics import (
 )
 from eitbench.bench.table import MISSING, Cell, Table, number_cell
 from eitbench.bench.text import format_interval, scores_by_seed
-from eitbench.bench.tracks import CATEGORIES
+from eitbench.bench.tracks import CATEGORIES, qualified_name
 from eitbench.report.boards import is_naive_baseline, record_category, skill_scores
 
 COMPARISON_FIELDS = ("environment", "score", "episodes", "a", "b", "difference", "low", "high",
@@ -146,7 +146,7 @@ def compare(a: list[dict[str, Any]], b: list[dict[str, Any]], score: str = "erro
 
 
 def _environment_and_split(record: dict[str, Any]) -> tuple[str, str]:
-    return record["environment"]["name"], record["split"]
+    return qualified_name(record["environment"]), record["split"]
 
 
 def _row(label: str, score: str, pairs: dict[str, Any], statistic: Statistic, *,
@@ -184,7 +184,7 @@ def comparison_table(table: pd.DataFrame, a: str, b: str, score: str = "error") 
             levels = {key: cell._replace(text=f"{SKILL_SCORE} {cell.text}")
                       for key, cell in levels.items()}
         rows.append({
-            "environment": row["environment"].removeprefix("eitbench-"),
+            "environment": row["environment"].removeprefix("eitbench/"),
             "better": less if row["high"] < 0 else more if row["low"] > 0 else MISSING,
             "episodes": Cell(str(row["episodes"]), float(row["episodes"])), **levels,
             "difference": Cell(three, row["difference"]),

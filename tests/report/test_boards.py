@@ -15,6 +15,7 @@ from eitbench.bench.statistics import interquartile_mean, stratified_bootstrap
 from eitbench.bench.tracks import environment_name
 from eitbench.report.boards import ALL, boards, record_category
 from eitbench.report.site import collect, render
+from eitbench.report.tables import BADGES
 
 from tiny import BOARD_IDS, RUN, record, sha
 
@@ -235,7 +236,9 @@ def test_csv_and_markdown_agree_with_the_episodes(folder):
         assert row["error"] == pytest.approx(means["error"], rel=1e-5)
         if "nis" in means:
             assert row["nis"] == pytest.approx(means["nis"], rel=1e-5)
-        title = row["environment"].removeprefix("eitbench-")
+        least = own.groupby("metric")["value"].min()
+        assert row["seconds_per_step"] == pytest.approx(least["seconds_per_step"], rel=1e-5)
+        title = row["environment"].removeprefix("eitbench/")
         section = texts["leaderboard.md"].split(f"### {title}, ")[1].split("###")[0]
         heading = [cell.strip() for cell in section.splitlines()[2].split("|")]
         (line,) = [line for line in section.splitlines()
@@ -244,7 +247,7 @@ def test_csv_and_markdown_agree_with_the_episodes(folder):
         assert float(cells["ẽ_c"].split()[0]) == pytest.approx(row["error"], rel=0.1)
         ranked = row["rank"] > 0
         assert cells["rank"].split()[0] == (f"{row['rank']:.0f}" if ranked else "–")
-        assert ranked or cells["method"].endswith(f"({row['note']})")
+        assert ranked or cells["method"].endswith(f"({BADGES.get(row['note'], row['note'])})")
         assert cells["run by"] == ("official" if row["official"] else "self-reported")
     assert "All environments" in texts["leaderboard.md"] and (table["environment"] == ALL).sum() == 2
 
@@ -253,7 +256,7 @@ def test_load_is_tidy(folder):
     """A row for each score of each episode; failures are there, outdated ones are marked, none of it is mixed up."""
     frame = eitbench.bench.load(folder)
     assert not frame.duplicated(["environment", "method", "version", "seed", "metric"]).any()
-    errors = frame[(frame["metric"] == "error") & (frame["environment"] == "eitbench-Pipe2D-v0")]
+    errors = frame[(frame["metric"] == "error") & (frame["environment"] == "eitbench/Pipe2D-v0")]
     assert errors.groupby(["method", "version"]).size().to_dict() == {
         ("homogeneous", "v1"): 8, ("b", sha("b1")[:8]): 8, ("a", "v1"): 8, ("a", "v2"): 8}
     failed = frame[frame["status"] == "failed"]
@@ -277,9 +280,9 @@ def test_the_example_in_the_docs_runs(folder):
     done = subprocess.run([sys.executable, str(ROOT / "docs" / "read_leaderboards.py"), str(folder)], check=True,
                           capture_output=True, text=True)
     frame = load(folder)
-    frame = frame[(frame["metric"] == "error") & ~frame["outdated"] & (frame["environment"] == "eitbench-Pipe2D-v0")]
+    frame = frame[(frame["metric"] == "error") & ~frame["outdated"] & (frame["environment"] == "eitbench/Pipe2D-v0")]
     best = frame.groupby(["method", "version"])["value"].mean().sort_values()
-    lines = done.stdout.split("eitbench-Pipe2D-v0")[1].splitlines()[2:6]
+    lines = done.stdout.split("eitbench/Pipe2D-v0")[1].splitlines()[2:6]
     assert [tuple(line.split()[:2]) for line in lines] == list(best.index) and len(lines) == 4
     assert [float(line.split()[2]) for line in lines] == pytest.approx(list(best), abs=5e-5)
 

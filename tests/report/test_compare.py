@@ -27,7 +27,7 @@ from tables import said
 from tiny import record, sha
 
 TANK = "eitbench/RotatingTank2D-v0"
-PIPE_NAME, TANK_NAME = "eitbench-Pipe2D-v0", "eitbench-RotatingTank2D-v0"
+PIPE_NAME, TANK_NAME = "eitbench/Pipe2D-v0", "eitbench/RotatingTank2D-v0"
 
 
 def two_methods():
@@ -41,7 +41,7 @@ def two_methods():
 
 
 def errors_of(records):
-    return {each["environment"]["name"]: scores_by_seed(each, "error") for each in records}
+    return {each["environment"]["id"]: scores_by_seed(each, "error") for each in records}
 
 
 def test_numbers_are_those_of_the_statistics():
@@ -133,7 +133,7 @@ def test_records_are_found_by_name_version_and_file(tmp_path, monkeypatch):
     write_record(tmp_path, tenth := record("c", [0.1], version="v10"))
     assert find_records("c@v1", tmp_path) == ours[:1] and find_records("c", tmp_path) == [tenth]
     for nobody in ("d", "c@v", f"a@{sha('a1')[:3]}"):                # of digits four are enough, fewer are not
-        with pytest.raises(ValueError, match=f"record of {nobody} in"):
+        with pytest.raises(ValueError, match=f"record of {nobody} "):
             find_records(nobody, tmp_path)
 
 
@@ -175,4 +175,4 @@ def test_in_a_terminal_lines_are_not_wrapped():
     assert narrow.endswith("columns omitted: episodes, ẽ_c of A, ẽ_c of B, A better")
     rows = narrow.split("\n\n")[1].splitlines()
     assert max(map(len, rows)) <= 60 and rows[0].split() == ["|", "environment", "|", "better", "|", "difference", "|"]
-    assert rows[3].split()[:4] == ["|", TANK_NAME.removeprefix("eitbench-"), "|", "A"]
+    assert rows[3].split()[:4] == ["|", TANK_NAME.removeprefix("eitbench/"), "|", "A"]

@@ -21,9 +21,10 @@ from eitbench._files import PACKAGE, bundled_path, replace_folder
 from eitbench._sanitize import escape_csv, escape_markdown
 from eitbench.bench.methods import baseline_folder, builtin_files, builtin_sha256, version_of
 from eitbench.bench.records import finished_at, group_runs, record_file_name, split_outdated
+from eitbench.bench.scores import scores
 from eitbench.bench.table import MISSING, Cell, Table, number_cell
 from eitbench.bench.text import scores_by_seed
-from eitbench.bench.tracks import environment_name, nominal_id
+from eitbench.bench.tracks import environment_name, nominal_id, qualified_name
 from eitbench.envs.env_docs import describe_environment
 from eitbench.report import tables
 from eitbench.report.boards import (
@@ -137,8 +138,9 @@ def render_site(site: Site) -> dict[str, bytes]:
 
 
 def render(site: Site) -> dict[str, str]:
-    """Return the content of ``leaderboard.csv`` and ``leaderboard.md``, by file name; records of
-    measurement files are in the second only."""
+    """Return the content of ``leaderboard.csv``, with the names and SI units of
+    `eitbench.bench.load`, and of ``leaderboard.md``, by file name; records of measurement files are
+    in the second only."""
     parts = ["# Leaderboards", "*Rendered from the records by `eitbench leaderboard --records "
              "leaderboards/results`; [README.md](README.md) explains how to add one.*",
              PUBLIC_EPISODES if site.boards else "No records yet."]
@@ -155,7 +157,12 @@ def render(site: Site) -> dict[str, str]:
         parts += ["## Superseded records", "From an earlier version of the method.\n\n"
                   + "\n".join(f"- {escape_markdown(record_file_name(record))}"
                               for record in outdated)]
-    table = leaderboard_table(site.boards)
+    table = leaderboard_table(site.boards).replace({"environment": {
+        record["environment"]["name"]: qualified_name(record["environment"])
+        for record in site.records}})
+    for name, factor in {**{name: score.factor for name, score in scores().items()},
+                         "peak_memory": 1e-6}.items():
+        table[name] /= factor
     texts = {name: table[name].map(escape_csv) for name in ("environment", "method", "title")}
     plain = table.assign(**texts).to_csv(index=False, float_format="%.6g", lineterminator="\n")
     return {"leaderboard.csv": plain, "leaderboard.md": "\n\n".join(parts) + "\n"}
