@@ -47,7 +47,7 @@ class Instrument:
     noise_relative: float = 0.01
     """std relative to the measurement [T]"""
     noise_relative_to_max: float = 0.001
-    """std relative to the largest voltage [T]"""
+    """std relative to the largest voltage, positive [T]"""
     noise_floor: float = 0.0
     """V; std of an additional absolute noise"""
     current_norm: str | None = None
@@ -74,8 +74,9 @@ class Instrument:
 
     def __post_init__(self) -> None:
         check_positive(self, current="A")
-        for name, units in (("noise_relative", ""), ("noise_relative_to_max", ""),
-                            ("noise_floor", "V"), ("interference", "V")):
+        # a voltage can be 0: without this part estimators would divide by zero
+        _check.number("noise_relative_to_max", self.noise_relative_to_max, low=0.0, open_low=True)
+        for name, units in (("noise_relative", ""), ("noise_floor", "V"), ("interference", "V")):
             _check.number(name, getattr(self, name), low=0.0, units=units)
         if self.current_norm is not None and self.current_norm not in CURRENT_NORMS:
             raise ValueError(f"current_norm must be one of {', '.join(CURRENT_NORMS)}, "

@@ -64,6 +64,7 @@ def test_every_number_can_be_named(id):
     (PIPE_2D, {"target": {"transverse_std": [0.02, 0.01]}}, "^world.target: transverse_std must be a range"),
     (PIPE_2D, {"target": {"arrivals": {"interval": 0.0}}}, "^world.target.arrivals: interval must be"),
     (PIPE_2D, {"target": {"radial_range": [0.5, 1.1]}}, "^world.target: radial_range must end above 0"),
+    (PIPE_2D, {"instrument": {"noise_relative_to_max": 0.0}}, "noise_relative_to_max must be a finite number in"),
     (PIPE_2D, {"instrument": {"noise_mismatch": -1.0}}, "^world.instrument: noise_mismatch must be a finite number in"),
     (PIPE_2D, {"instrument": {"n_dead_range": [8, 8], "n_failing_range": [7, 7]}}, "electrodes without fault"),
     (PIPE_2D, {"schedule": {"time_step": float("nan")}}, "^world.schedule: time_step must be"),
