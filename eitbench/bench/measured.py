@@ -47,13 +47,14 @@ class MeasuredRun:
     there are none, of all with this electrode), relative to the noise, of the estimate before each
     reading; for a target at rest, of the last estimate. NaN without any."""
     seconds_per_step: float
+    withheld_rmse_volts: float = math.nan
+    """V, RMS residual of all withheld readings that are scored"""
 
     @property
     def withheld_rmse(self) -> float:
         """RMS residual of all withheld readings that are scored; 1 is the noise level, NaN without
         any."""
-        scored = self.withheld_residual_rms[np.isfinite(self.withheld_residual_rms)]
-        return float(np.sqrt(np.mean(scored**2))) if len(scored) else math.nan
+        return _root_mean(self.withheld_residual_rms**2)
 
     def mean_nis(self, warm_up: int) -> float | None:
         """Mean NIS/m after the warm-up; None if the method has no innovations."""
@@ -68,7 +69,7 @@ class MeasuredRun:
         """Collect (t, estimate, measurement, seconds) step by step; of the estimates only those at
         the steps ``kept``, by default all."""
         T, velocity = env.episode_steps, env.task.velocity
-        residual, nis = np.full(T, np.nan), np.full(T, np.nan)
+        residual, squares, nis = np.full((3, T), np.nan)
         theta = None if velocity is None else np.tile(velocity.nominal, (T, 1))
         electrodes = _ElectrodeResiduals(env)
         at_rest = isinstance(env.task.transport, StationaryTransport)
@@ -83,8 +84,10 @@ class MeasuredRun:
             if theta is not None and estimate.velocity is not None:
                 theta[t - 1] = estimate.velocity
             for scored in env.scoring_steps(t):
-                if len(off := env.withheld_residuals(scored, mean)):
-                    residual[scored - 1] = np.sqrt(np.mean(off**2))
+                relative, volts = env.withheld_residuals(scored, mean)
+                if len(relative):
+                    residual[scored - 1] = np.sqrt(np.mean(relative**2))
+                    squares[scored - 1] = np.mean(volts**2)
             if not at_rest:
                 electrodes.add(t, before if t > 1 else mean)
             before = mean
@@ -98,7 +101,7 @@ class MeasuredRun:
         return cls(method, np.array(list(estimates)),
                    np.array([each.mean for each in estimates.values()]),
                    _variances(list(estimates.values())), nis, residual, theta, electrodes.times,
-                   electrodes.rms(), seconds / T)
+                   electrodes.rms(), seconds / T, _root_mean(squares))
 
     def outcome(self, env: MeasuredEnv) -> Outcome:
         """Return what can be scored: withheld readings, innovations, and the truth of a case."""
@@ -123,6 +126,12 @@ class MeasuredRun:
         content = io.BytesIO()
         np.savez_compressed(content, **arrays)
         write_atomically(path, content.getvalue())
+
+
+def _root_mean(squares: np.ndarray) -> float:
+    """Return the root of the mean of the finite entries; NaN without any."""
+    finite = squares[np.isfinite(squares)]
+    return float(np.sqrt(np.mean(finite))) if len(finite) else math.nan
 
 
 class _ElectrodeResiduals:

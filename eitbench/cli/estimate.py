@@ -73,7 +73,8 @@ def estimate(
             run = run_on_measurements(env, name, seed, kept=kept)
             runs.append(run)
             score = ("no measurement is withheld, so nothing is scored" if not env.withheld
-                     else f"withheld RMSE {run.withheld_rmse:.2f} noise std")
+                     else f"withheld RMSE {run.withheld_rmse:.2f} noise std, "
+                          f"{1e3 * run.withheld_rmse_volts:.3g} mV")
             options.echo(f"{run.method}: {score}")
             if run.velocity is not None:
                 velocity = ", ".join(f"{each:.3g}" for each in run.velocity[-1])

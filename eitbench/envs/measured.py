@@ -184,7 +184,7 @@ class MeasuredEnv(FixedLengthEnv):
         self._last = estimate = check_actions(action, self.action_space, n)[:n].copy()
         reward = 0.0
         if steps := self.scoring_steps(self._step):
-            residuals = np.concatenate([self.withheld_residuals(t, estimate) for t in steps])
+            residuals = np.concatenate([self.withheld_residuals(t, estimate)[0] for t in steps])
             reward = -float(np.mean(residuals**2)) if len(residuals) else 0.0
         self._step += 1
         return (self._observe(), reward, self._step > self.episode_steps, False,
@@ -218,12 +218,14 @@ class MeasuredEnv(FixedLengthEnv):
             return range(1, self.episode_steps + 1) if t == self.episode_steps else range(0)
         return range(t, t + 1) if t > self.task.warm_up else range(0)
 
-    def withheld_residuals(self, t: int, estimate: np.ndarray) -> np.ndarray:
-        """Residuals of an estimate (n,) at the readings withheld at t = 1 … T, relative to the
-        standard deviation of their noise."""
-        withheld = self.withheld_mask[self.measurements.injection_index[t - 1]]
-        residuals = self.residuals(t, estimate)[withheld]
-        return residuals[np.isfinite(residuals)]
+    def withheld_residuals(self, t: int, estimate: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Residuals of an estimate (n,) at the readings withheld at t = 1 … T: relative to the
+        standard deviation of their noise, and in V."""
+        residuals = self.residuals(t, estimate)
+        is_scored = (self.withheld_mask[self.measurements.injection_index[t - 1]]
+                     & np.isfinite(residuals))
+        std = self.task.noise.std(np.nan_to_num(self.measurements.voltages[t - 1]))
+        return residuals[is_scored], (residuals * std)[is_scored]
 
     def residuals(self, t: int, estimate: np.ndarray) -> np.ndarray:
         """(M,) residuals of an estimate (n,) at all readings of t = 1 … T, relative to the

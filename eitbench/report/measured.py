@@ -50,7 +50,8 @@ def write_report(path: Path, env: MeasuredEnv, runs: Sequence[MeasuredRun],
     calibration = env.calibration
     page = render_template(
         "measured.html.j2", root="", title=str(source.pop("file", "Measurements")), source=source,
-        methods=[(run.method, run.withheld_rmse, run.mean_nis(env.task.warm_up)) for run in runs],
+        methods=[(run.method, run.withheld_rmse, 1e3 * run.withheld_rmse_volts,
+                  run.mean_nis(env.task.warm_up)) for run in runs],
         warnings=env.quality_warnings(),
         facts=_facts(env), estimate=_estimate(env, runs[0]), first=runs[0].method,
         over_time=_figure(_over_time(env, runs)), velocity=_velocity(env, runs),

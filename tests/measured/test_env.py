@@ -47,7 +47,7 @@ def test_rewards_are_withheld_residuals(quick):
         rewards.append(reward)
     assert len(rewards) == 48
     assert not any(rewards[:8])
-    expected = -np.mean(quick.unwrapped.withheld_residuals(20, estimate)**2)
+    expected = -np.mean(quick.unwrapped.withheld_residuals(20, estimate)[0]**2)
     assert rewards[19] == pytest.approx(expected)
 
 
@@ -226,6 +226,7 @@ def test_a_spike_is_named_and_left_out(measurements, frame):
     assert f"frame {frame + 1}, injection 4, channel 7" in env.quality_warnings()[0]
     assert np.linalg.norm(found - position) < 5e-3
     assert run.withheld_rmse == pytest.approx(clean.withheld_rmse, rel=0.2)
+    assert run.withheld_rmse_volts == pytest.approx(clean.withheld_rmse_volts, rel=0.2)
 
 
 def test_moving_targets_have_no_spikes(measurements):
