@@ -48,6 +48,11 @@ _LAZY_NAMES = {"Estimate": "worlds.task", "Task": "worlds.task", "make_task": "w
 _LAZY_MODULES = {"leaderboard": "bench", "plot": "report.plot", "rl": "rl"}
 
 
+def __dir__() -> list[str]:
+    """Return the public names, imported or not."""
+    return sorted({*globals(), *_LAZY_NAMES, *_LAZY_MODULES})
+
+
 def __getattr__(name: str) -> Any:
     """Import public names on first use (PEP 562)."""
     with _require_extra(f"eitbench.{name}"):

@@ -1,4 +1,4 @@
-"""The command `eitbench`, also as `python -m eitbench.cli`."""
+"""The command `eitbench`, also as `python -m eitbench`."""
 
 import sys
 

@@ -193,13 +193,15 @@ def compare(
         help="A record's file, or METHOD or METHOD@VERSION among the records.")],
     b: Annotated[str, typer.Argument(help="The same of the other.")],
     records: options.Records = options.RECORDS,
+    env: options.Environments = None,
     score: Annotated[str, typer.Option(help="By which score.")] = "error",
 ) -> None:
     """Compare two methods seed by seed: differences with intervals, and how often the first is
     better; over several environments by gains, as on the boards."""
     from eitbench.report import compare as comparison
     with options.cli_errors():
-        ours, theirs = (comparison.find_records(name, records) for name in (a, b))
+        ours, theirs = ([record for record in comparison.find_records(name, records)
+                         if not env or record["environment"]["id"] in env] for name in (a, b))
         table = comparison.compare(ours, theirs, score, comparison.naive_baseline_records(records))
     names = comparison.display_names(ours[0], theirs[0])
     width = shutil.get_terminal_size().columns

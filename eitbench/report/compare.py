@@ -31,7 +31,7 @@ from eitbench.bench.text import format_interval, scores_by_seed
 from eitbench.bench.tracks import CATEGORIES, qualified_name
 from eitbench.report.boards import is_naive_baseline, record_category, skill_scores
 
-COMPARISON_FIELDS = ("environment", "score", "episodes", "a", "b", "difference", "low", "high",
+COMPARISON_FIELDS = ("environment", "score", "episodes", "a", "b", "advantage", "low", "high",
           "better", "better_low", "better_high")
 SKILL_SCORE = "skill score"
 """Score over several environments instead of the error, whose mean the largest error dominates."""
@@ -105,10 +105,11 @@ def compare(a: list[dict[str, Any]], b: list[dict[str, Any]], score: str = "erro
     Returns
     -------
     DataFrame
-        environment, score (or `SKILL_SCORE`), episodes; a, b: means; difference: a − b, with the
-        ends of its 95 % interval; better: fraction of episodes in which a is better (an equal score
-        counts ½), with the ends of its interval. Over several environments interquartile means of
-        gains, or means of the environments' means.
+        environment, score (or `SKILL_SCORE`), episodes; a, b: means; advantage: by how much a is
+        better, b − a of scores of which less is better, else a − b, with the ends of its 95 %
+        interval; better: fraction of episodes in which a is better (an equal score counts ½), with
+        the ends of its interval. Over several environments interquartile means of skill scores, or
+        means of the environments' means.
 
     Raises
     ------
@@ -155,7 +156,8 @@ def _row(label: str, score: str, pairs: dict[str, Any], statistic: Statistic, *,
     means = [float(statistic(*[list(own.values()) for own in side.values()]))
              for side in (ours, theirs)]
     return (label, score, sum(map(len, ours.values())), *means,
-            *paired_difference(ours, theirs, statistic=statistic),
+            *paired_difference(*((ours, theirs) if higher else (theirs, ours)),
+                               statistic=statistic),
             *paired_probability_of_improvement(ours, theirs, higher_is_better=higher))
 
 
@@ -168,13 +170,12 @@ def display_names(a: dict[str, Any], b: dict[str, Any]) -> tuple[str, str]:
 
 def comparison_table(table: pd.DataFrame, a: str, b: str, score: str = "error") -> Table:
     """Return the comparison of methods named ``a`` and ``b``, with the better one where the
-    95 % interval of the difference excludes zero."""
+    95 % interval of the advantage of a excludes zero."""
     asked = resolve_score(score)
     rows = []
     for row in table.to_dict("records"):
         is_gain = row["score"] == SKILL_SCORE
-        less, more = (b, a) if is_gain or asked.direction == "higher" else (a, b)
-        three = format_interval(row["difference"], row["low"], row["high"])
+        three = format_interval(row["advantage"], row["low"], row["high"])
         share = f"{100 * row['better']:.0f} %"
         if math.isfinite(row["low"]):
             share += f" ({100 * row['better_low']:.0f} to {100 * row['better_high']:.0f} %)"
@@ -185,9 +186,9 @@ def comparison_table(table: pd.DataFrame, a: str, b: str, score: str = "error") 
                       for key, cell in levels.items()}
         rows.append({
             "environment": row["environment"].removeprefix("eitbench/"),
-            "better": less if row["high"] < 0 else more if row["low"] > 0 else MISSING,
+            "better": b if row["high"] < 0 else a if row["low"] > 0 else MISSING,
             "episodes": Cell(str(row["episodes"]), float(row["episodes"])), **levels,
-            "difference": Cell(three, row["difference"]),
+            f"advantage of {a}": Cell(three, row["advantage"]),
             f"{a} better": Cell(share, row["better"])})
     return Table.of(rows, label="Comparison", keep=list(rows[0]))
 
@@ -195,7 +196,8 @@ def comparison_table(table: pd.DataFrame, a: str, b: str, score: str = "error") 
 def format_comparison(table: pd.DataFrame, a: str, b: str, score: str, width: int) -> str:
     """Return the comparison in lines of ``width`` characters, where the methods are A and B."""
     whole = comparison_table(table, "A", "B", score)
-    first = ("environment", "better", "difference", *whole.headings[3:5], "A better", "episodes")
+    first = ("environment", "better", "advantage of A", *whole.headings[3:5], "A better",
+             "episodes")
     fitted = whole.fit_width(width, first)
     return "\n\n".join([f"A: {a}\nB: {b}", fitted.markdown(),
                         *filter(None, [whole.omitted_columns(fitted)])])
