@@ -121,6 +121,6 @@ def test_many_members_give_the_kalman_filter(monkeypatch):
 def test_mistakes_are_told():
     with pytest.raises(ValueError, match="members must be"):
         ensemble(members=1)
-    with pytest.raises(ValueError, match="the prior must be of the task's inlet"):
+    with pytest.raises(ValueError, match="the prior must be for the task's inlet"):
         EnsembleFilter(make_task(TINY), prior("linear"), LEVEL, ensemble().flow, 10, 2, np.random.default_rng(0),
                        linearise_at_prediction(task()))

@@ -154,5 +154,5 @@ def test_not_settling_is_an_error():
     n, model = quadratic()
     currents = np.array([[1.0, -1.0, 0.0, 0.0]])
     voltages = model.voltages(np.full(n, 30.0), currents)
-    with pytest.raises(RuntimeError, match=r"did not settle in 1 iterations; last change .* mol/m³"):
+    with pytest.raises(RuntimeError, match=r"did not converge in 1 iterations; last change .* mol/m³"):
         best_homogeneous(model, VoltageNoise(), n, voltages, currents, 10.0, max_iterations=1)

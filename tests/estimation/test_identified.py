@@ -158,7 +158,7 @@ def test_filter_linearises_once_if_the_model_says_so():
         expected = at.value - at.matrix @ filter_.space.concentration(mean) - std * once().mean_voltage_error[number]
         np.testing.assert_allclose(step.innovation_covariance, S, rtol=1e-9, atol=1e-12 * S.max())
         np.testing.assert_allclose(step.innovation, expected, atol=1e-12)
-    with pytest.raises(ValueError, match="model must have voltages that are linearised anew"):
+    with pytest.raises(ValueError, match="model must have voltages that are linearised at each estimate"):
         maximise_posterior(filter_, task(), [], once())
 
 

@@ -240,7 +240,7 @@ def test_other_files_are_told(tmp_path, text):
 
 
 def test_what_does_not_fit_is_told():
-    with pytest.raises(ValueError, match=r"the prior must be of the task's inlet, 0 nodes"):
+    with pytest.raises(ValueError, match=r"the prior must be for the task's inlet, 0 nodes"):
         InflowWindow(make_task(ROTATING_TANK), prior(), LEVEL)
     with pytest.raises(ValueError, match="link must be one of linear, logarithm, got 'log'"):
         InflowPrior("log", prior().points, prior().modes, prior().correlation, 0.005)

@@ -174,7 +174,7 @@ def test_flows_of_a_task():
 
 
 def test_what_does_not_fit_is_told():
-    with pytest.raises(ValueError, match="task must ask for the flow"):
+    with pytest.raises(ValueError, match="task must have an unknown velocity"):
         task_velocity_prior(task())
     with pytest.raises(ValueError, match="task must have a flow, got StationaryTransport"):
         scaled_velocity_prior(make_task(STATIONARY_TANK_2D), 0.3, 0.0)
@@ -186,5 +186,5 @@ def test_what_does_not_fit_is_told():
         started(flow(), 0)
     with pytest.raises(ValueError, match="bounds must be a range"):
         replace(flow(), bounds=(0.5, 0.9))
-    with pytest.raises(ValueError, match="the prior must be of the task's inlet"):
+    with pytest.raises(ValueError, match="the prior must be for the task's inlet"):
         VelocityInflowWindow(make_task(TINY), prior(), LEVEL, flow(), 12)
