@@ -73,8 +73,8 @@ def test_predicts_states_of_unseen_episodes():
 
 
 def test_residual_fit_needs_few_episodes():
-    """The residual fit to eight episodes has a smaller error on unseen episodes than the task's flow, and a much smaller
-    error than a full fit; with 24 episodes it is below six tenths, and matches its covariance."""
+    """The residual fit to eight episodes has a smaller error on unseen episodes than the task's flow, and a much
+    smaller error than a full fit; with 24 episodes it is below six tenths, and matches its covariance."""
     mass = examples("train:0").mass
     corrected = identify_model(examples("train:0-23"), modes=24, residual_only=True)
     responses = {"told": steady_response(task().transport), "corrected by 24": corrected.response}
