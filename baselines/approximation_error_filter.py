@@ -1,7 +1,7 @@
-"""Filter with voltages that are linearised once, and an approximation error: mean and covariance of
-what linearised model, coarse mesh and a velocity that is told wrong are off in training episodes.
+"""Filter with voltages that are linearised once, and an approximation error: the mean and
+covariance, over training episodes, of the errors of linearisation, mesh and assumed velocity.
 
-The inflow's logarithm is Gaussian and coloured as there. With a lag it looks back over as many.
+The inflow's logarithm has a coloured Gaussian prior, also fitted to training episodes.
 """
 
 from pathlib import Path

@@ -1,8 +1,8 @@
 """Automatic choice: the state space and the linearisation follow from what the task specifies.
 
-A requested velocity is estimated with the inflow; a flow that training episodes have identified
-takes the place of the nominal one; where there is only a prior of the inflow, the nominal velocity
-may be off by a factor; rare slugs get two regimes; a target at rest is estimated by its logarithm.
+An unknown velocity is estimated with the inflow. An identified model replaces the nominal flow;
+with only a prior of the inflow, the nominal velocity is scaled by an unknown factor. Rare slugs
+have two regimes. For stationary targets, the state is the logarithm of the concentration.
 """
 
 from pathlib import Path
@@ -34,13 +34,13 @@ from eitbench.physics.stationary import StationaryTransport
 
 HERE = Path(__file__).parent
 BOUNDS = (0.05, 4.0)
-"""Of the axial velocity, relative to the nominal one."""
+"""Bounds of the axial velocity, relative to the nominal one."""
 WINDOW = 30
-"""Time steps of a window of inflows and velocities."""
+"""Length of a window of inflows and velocities, in time steps."""
 FACTOR_STD = 0.3
-"""Of the nominal velocity where no model was identified."""
+"""Standard deviation of the velocity factor without an identified model."""
 LEVEL_STD = 0.05
-"""Of the inflow between rare slugs, relative to the best homogeneous estimate."""
+"""Standard deviation of the inflow between rare slugs, relative to the homogeneous estimate."""
 
 
 class Estimator:
@@ -62,7 +62,7 @@ class Estimator:
 
     @staticmethod
     def suits(task: Task) -> bool:
-        """Return whether present states are requested, or a prior allows to look back."""
+        """Return True for the filtering subtrack, and for tasks with an inflow prior."""
         return not task.lag or (task.velocity is None
                                 and bool(compatible_priors(HERE / "priors", task, "logarithm")))
 

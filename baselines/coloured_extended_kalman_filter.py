@@ -1,8 +1,5 @@
-"""Extended Kalman filter with a coloured inflow: slugs last several injections and are centimetres
-wide, as those of training episodes were; relinearised about each prediction.
-
-With a lag it looks back over as many measurements.
-"""
+"""Extended Kalman filter with a coloured inflow: a Gaussian prior, correlated in time and across
+the inlet, fitted to training episodes; voltages are linearised about each prediction."""
 
 from pathlib import Path
 

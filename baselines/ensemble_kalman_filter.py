@@ -1,8 +1,8 @@
-"""Ensemble Kalman filter: members with an inflow and a flow of their own stand for what is known,
-where the joint filters carry a covariance.
+"""Ensemble Kalman filter: members with separate inflows and velocities represent the posterior,
+instead of the covariance of the joint filters.
 
-The inflow's logarithm is Gaussian and coloured as in training episodes. Where a task asks for no
-flow, the one that it tells is believed.
+The inflow's logarithm has a coloured Gaussian prior fitted to training episodes. A velocity that
+the task specifies is assumed to be exact.
 """
 
 from pathlib import Path
@@ -23,11 +23,11 @@ PRIORS = Path(__file__).with_name("priors")
 LINK = "logarithm"
 MEMBERS = 256
 LEAD_IN = 30
-"""Time steps until the members' inflows fill the pipe."""
+"""Spin-up: time steps until the members' inflows fill the pipe."""
 BOUNDS = (0.05, 4.0)
-"""Of the axial velocity, in parts of the one believed at first."""
+"""Bounds of the axial velocity, relative to its prior mean."""
 SEED = 0
-"""Every episode is filtered by the same draws."""
+"""Random seed of the ensemble, the same in every episode."""
 
 
 class Estimator:
@@ -45,7 +45,7 @@ class Estimator:
 
     @staticmethod
     def suits(task: Task) -> bool:
-        # a 3D inlet has more modes than an ensemble of this size can tell apart
+        # a 3D inlet has too many modes for an ensemble of this size
         return task.mesh.dim == 2 and bool(compatible_priors(PRIORS, task, LINK))
 
     def update(self, voltages: np.ndarray, currents: np.ndarray) -> Estimate | None:

@@ -1,5 +1,4 @@
-"""Extended Kalman filter: the observation is linearised anew about each prediction; else as the
-Kalman filter."""
+"""Extended Kalman filter: as `kalman_filter`, but voltages are linearised about each prediction."""
 
 import numpy as np
 

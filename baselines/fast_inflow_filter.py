@@ -1,7 +1,7 @@
-"""Filter of the inflow's logarithm that keeps pace with the instrument in 3D: log_inflow_filter in
-the few directions in which inflows move the concentration, with voltages quadratic in them.
+"""Filter of the inflow's logarithm that keeps pace with the instrument in 3D: `log_inflow_filter`
+in the leading directions of the response to inflows, with voltages quadratic in them.
 
-It is told the flow and learns nothing more than the inflow's prior.
+It uses the task's flow and a prior of the inflow fitted to training episodes.
 """
 
 from dataclasses import replace
@@ -23,9 +23,9 @@ from eitbench.estimation import (
 PRIORS = Path(__file__).with_name("priors")
 LINK = "logarithm"
 MODES = 160
-"""Of the concentration; in 3D they leave 0.02 % of it, where the filter is off by 0.12 %."""
+"""Number of concentration modes; the 3D projection error is 0.02 %, the filter's error 0.12 %."""
 BENT = 48
-"""The first of them, in which voltages are quadratic."""
+"""Number of leading modes in which voltages are quadratic."""
 
 
 class Estimator:
@@ -50,6 +50,6 @@ class Estimator:
 
 @lru_cache(maxsize=2)
 def reduced(transport, observation, level, prior):
-    """Made once for all episodes."""
+    """Return the reduced response and voltage model, computed once for all episodes."""
     response = reduced_response(steady_response(transport), prior, MODES)
     return response, ScaledVoltageModel(observation, level, response.basis[:, :BENT])

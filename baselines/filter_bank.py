@@ -1,9 +1,9 @@
-"""Bank of Kalman filters: nine mean velocities are assumed side by side, and the one that fits the
-voltages speaks.
+"""Bank of Kalman filters: one filter for each of nine mean velocities; the filter that fits the
+voltages best provides the estimate.
 
-Each filter has its own flow, the one believed at first made faster or slower. What fits is measured
-by the innovations, whitened (NIS), over the last frame: the voltage discrepancy of thesis 5.13 in
-units of its own uncertainty.
+Each filter assumes the nominal velocity times a factor. The fit is the normalised innovation
+squared (NIS) over the last frame: the voltage discrepancy of thesis 5.13 relative to its
+uncertainty.
 """
 
 from functools import lru_cache
@@ -33,7 +33,7 @@ class Estimator:
 
 
 class FilterBank:
-    """Filters side by side, and how well each has fitted the last voltages."""
+    """Filters of all velocities and their NIS at each step."""
 
     def __init__(self, task: Task, c_ref: float) -> None:
         assert task.velocity is not None
@@ -57,6 +57,6 @@ class FilterBank:
 
 @lru_cache(maxsize=2)
 def transports(transport, flow):
-    """The evolution model with each velocity; kept, as episodes share what filters derive of it."""
+    """Return the transport model for each velocity; cached, so that episodes share derived data."""
     return [transport.with_velocity(flow.field(factor * np.array(flow.nominal)))
             for factor in FACTORS]

@@ -1,5 +1,5 @@
-"""Fixed-interval Kalman smoother (thesis 5.1.2): the Kalman filter, and then back over the whole
-record."""
+"""Fixed-interval Kalman smoother (thesis 5.1.2): the Kalman filter and a backward pass over all
+measurements."""
 
 from collections.abc import Sequence
 

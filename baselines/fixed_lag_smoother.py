@@ -1,4 +1,4 @@
-"""Fixed-lag Kalman smoother: the Kalman filter, and at each measurement back over the last few."""
+"""Fixed-lag Kalman smoother: the Kalman filter, and a backward pass over the lag at each step."""
 
 import numpy as np
 
@@ -23,12 +23,12 @@ class Estimator:
 
 
 class FixedLagSmoother:
-    """Kalman filter and its last steps."""
+    """Kalman filter with its last steps."""
 
     def __init__(self, task: Task, c_ref: float) -> None:
         self.lag = task.lag
         self.filter = nodal_filter(task.transport, task.prior, c_ref,
-                                      linearise_at_reference(task, c_ref))
+                                   linearise_at_reference(task, c_ref))
         self.steps: list[Step] = []
 
     def assimilate(self, voltages: np.ndarray, currents: np.ndarray) -> None:

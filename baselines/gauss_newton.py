@@ -1,10 +1,10 @@
-"""Stationary Gauss–Newton (thesis 5.11): each frame of 16 injections is taken for a target that
-stands still.
+"""Stationary Gauss–Newton (thesis 5.11): reconstruction of each frame of 16 injections under the
+assumption of a stationary target.
 
-When filtering, the frame is the latest 16 injections; when smoothing, it is the thesis' own: each
-state takes the image of the frame that contains it (Fig. 5.6). ALPHA was tuned once, on stationary
-targets from the training seeds, by `studies/tune_gauss_newton.py`, whose rule is the smallest mean
-error on a grid of two values an octave.
+In the filtering subtrack, the frame consists of the latest 16 injections; in the smoothing subtrack
+each state gets the image of the frame that contains it, as in the thesis (Fig. 5.6). ALPHA was
+tuned once, on stationary targets from the training seeds, by `studies/tune_gauss_newton.py`, to the
+smallest mean error on a grid of two values per octave.
 """
 
 import numpy as np
@@ -14,7 +14,7 @@ from eitbench.estimation import best_homogeneous, gauss_newton
 from eitbench.numerics.fem import stiffness_matrix
 
 ALPHA = 0.177
-"""1/(mol/m³): weighs the gradient of c/(1 mol/m³) against voltages in noise standard deviations"""
+"""1/(mol/m³): weight of the gradient of c relative to voltages in noise standard deviations"""
 
 
 class Estimator:
@@ -44,7 +44,7 @@ class Estimator:
         return Estimate(self.image(max(0, end - frame), end))
 
     def image(self, begin: int, end: int) -> np.ndarray:
-        """The stationary image of measurements begin + 1 … end."""
+        """Return the stationary reconstruction from measurement vectors begin + 1 … end."""
         if end not in self.images:
             task = self.task
             n = task.mesh.n_nodes

@@ -1,5 +1,5 @@
-"""Best homogeneous estimate: one constant, fitted to all complete frames so far. The floor on
-every board."""
+"""Best homogeneous estimate: one constant, fitted to all complete frames so far. A naive baseline
+of every leaderboard."""
 
 import numpy as np
 

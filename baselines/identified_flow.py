@@ -1,8 +1,8 @@
-"""Filter and smoother with a flow that training episodes have shown: what past inflows leave in the
-pipe is learned from true states, and so is by how much that and the voltages are off.
+"""Filter and smoother with a flow that training episodes have shown: the impulse response of the
+pipe and the errors of states and voltages are identified from training episodes.
 
-The inflow's logarithm is Gaussian and coloured. As filter, each measurement is linearised twice;
-with a lag it looks back over as many. As smoother it finds the most probable inflow.
+The inflow's logarithm has a coloured Gaussian prior. The filter, also with a fixed lag, linearises
+each measurement vector twice. The smoother computes the most probable inflow.
 """
 
 from pathlib import Path

@@ -1,5 +1,5 @@
-"""Smoother of the inflow's logarithm: the most probable inflow of the whole record, by nonlinear
-Gauss–Newton, with a prior that is coloured as in training episodes.
+"""Smoother of the inflow's logarithm: the most probable inflow given all measurements, by nonlinear
+Gauss–Newton, with a coloured prior fitted to training episodes.
 """
 
 from pathlib import Path

@@ -1,8 +1,7 @@
 """Joint extended Kalman filter (thesis ch. 6): concentration and velocity parameters in one state.
 
-The flow is updated with every injection from the first frame on. Its axial velocity is kept between
-0.05 and 4 times the one believed at first, everywhere across the pipe: fluid does not flow back,
-and an estimate that runs away returns.
+The velocity is updated with every injection from the first frame on. Across the pipe it is kept
+between 0.05 and 4 times its prior mean, to exclude backflow and divergence of the estimate.
 """
 
 import numpy as np

@@ -1,7 +1,7 @@
-"""Joint extended Kalman filter with a coloured inflow: the inflow's logarithm, Gaussian and
-coloured as that of training episodes, and the flow that carries it are one state.
+"""Joint extended Kalman filter with a coloured inflow: the state holds the velocity and the
+inflow's logarithm, with a coloured Gaussian prior fitted to training episodes.
 
-Where a task asks for no flow, the one that it tells is believed but for a factor.
+A velocity that the task specifies is scaled by an unknown factor.
 """
 
 from pathlib import Path
@@ -22,12 +22,12 @@ from eitbench.estimation import (
 PRIORS = Path(__file__).with_name("priors")
 LINK = "logarithm"
 WINDOW = 30
-"""Inflows that are not yet known for good: the fluid passes the pipe in 18 steps on average."""
+"""Number of past inflows in the state; the mean residence time is 18 steps."""
 BOUNDS = (0.05, 4.0)
-"""Of the axial velocity, in parts of the one believed at first."""
+"""Bounds of the axial velocity, relative to its prior mean."""
 FACTOR_STD = 0.3
 FACTOR_WALK = 0.0
-"""What is believed of the factor."""
+"""Standard deviations of the initial factor and of its steps."""
 
 
 class Estimator:
@@ -45,7 +45,7 @@ class Estimator:
 
     @staticmethod
     def suits(task: Task) -> bool:
-        # a 3D inlet has four times the nodes, whose traces all have to be carried along
+        # a 3D inlet has four times the nodes, and all their contributions are propagated
         return task.mesh.dim == 2 and bool(compatible_priors(PRIORS, task, LINK))
 
     def update(self, voltages: np.ndarray, currents: np.ndarray) -> Estimate | None:

@@ -1,10 +1,10 @@
-"""Recurrent network that corrects the log-inflow filter: learned from training episodes in which
-the fluid flows faster or slower than the model says.
+"""Recurrent network that corrects the log-inflow filter: trained on episodes in which the velocity
+differs from the model's.
 
-A GRU (Cho et al. 2014) sees how each measurement compares with the filter's prediction, and what
-the filter thinks before and after it, in the modes of training concentrations. It says in these
-modes by how much the filter is off, and with which variance. `studies/learn.py` trains it; here it
-needs numpy alone, and the network, which is in a checkout only.
+The inputs of the GRU (Cho et al. 2014) are the filter's innovations and its estimates before and
+after each measurement vector, in modes of training concentrations. Its outputs are the correction
+of the filter in these modes and its variance. `studies/learn.py` trains the network; inference
+needs numpy and the network file, which only a checkout contains.
 """
 
 from pathlib import Path
@@ -37,8 +37,7 @@ class Estimator:
 
     @staticmethod
     def suits(task: Task) -> bool:
-        """Only the task that it was trained for: that vessel, those injections, that model of the
-        flow."""
+        """Return True for tasks with the vessel, injections and flow model of the training."""
         known_inlet = bool(compatible_priors(HERE / "priors", task, "logarithm"))
         return known_inlet and network_matches_task(HERE / NETWORK, task)
 

@@ -1,9 +1,10 @@
 """Recurrent network that corrects what the log-inflow filter thinks of a state four measurements
-later: learned from training episodes.
+later: trained on training episodes.
 
-The network is as in `learned_correction`, and sees what the filter thinks now, and now of four
-steps before. `studies/learn.py` trains it; here it needs numpy alone, and the network, which is in
-a checkout only. When the record has ended, and the lag shrinks, the filter stands alone.
+The network is as in `learned_correction`; its inputs include the filter's present estimates of the
+present state and of the state four steps ago. `studies/learn.py` trains it; inference needs numpy
+and the network file, which only a checkout contains. After the last measurement, when the lag
+shrinks, the filter's estimates are not corrected.
 """
 
 from pathlib import Path
@@ -37,8 +38,7 @@ class Estimator:
 
     @staticmethod
     def suits(task: Task) -> bool:
-        """Only the task that it was trained for: that lag, that vessel, those injections, that
-        model of the flow."""
+        """Return True for tasks with the lag, vessel, injections and flow model of the training."""
         known_inlet = bool(compatible_priors(HERE / "priors", task, "logarithm"))
         return task.lag == LAG and known_inlet and network_matches_task(HERE / NETWORK, task)
 

@@ -1,8 +1,8 @@
 """Recurrent network that corrects the filter with the flow that training episodes have shown:
-learned past an obstacle, where the flow is not the parabola of the model.
+trained in a pipe with an obstacle, where the velocity profile differs from the model's parabola.
 
-The network is as in `learned_correction`, the filter that of `identified_flow`. `studies/learn.py`
-trains it; here it needs numpy alone, and the network, which is in a checkout only.
+The network is as in `learned_correction`, the filter as in `identified_flow`. `studies/learn.py`
+trains it; inference needs numpy and the network file, which only a checkout contains.
 """
 
 from pathlib import Path
@@ -37,8 +37,7 @@ class Estimator:
 
     @staticmethod
     def suits(task: Task) -> bool:
-        """Only the task that it was trained for: that vessel, those injections, that model of the
-        flow."""
+        """Return True for tasks with the vessel, injections and flow model of the training."""
         known = (compatible_priors(HERE / "priors", task, "logarithm")
                  and compatible_models(HERE / "models", task))
         return bool(known) and network_matches_task(HERE / NETWORK, task)

@@ -1,10 +1,10 @@
 """Recurrent network that reads the whole record from both ends, and corrects what the log-inflow
-filter thinks of each state 20 measurements later: learned from training episodes.
+filter estimates of each state 20 measurements later: trained on training episodes.
 
-A bidirectional GRU (Schuster & Paliwal 1997, Cho et al. 2014) sees how each measurement compares
-with the filter's prediction, what the filter thinks at that time, and what it thinks later, in the
-modes of training concentrations. `studies/learn.py` trains it; here it needs numpy alone, and the
-network, which is in a checkout only.
+The inputs of the bidirectional GRU (Schuster & Paliwal 1997, Cho et al. 2014) are the filter's
+innovations and its estimates at that time and 20 steps later, in modes of training concentrations.
+`studies/learn.py` trains it; inference needs numpy and the network file, which only a checkout
+contains.
 """
 
 from collections.abc import Iterator
@@ -27,7 +27,7 @@ from eitbench.estimation import (
 HERE = Path(__file__).parent
 NETWORK = "networks/pipe2d-smoothing.npz"
 LAG = 20
-"""Measurements after which the filter learns next to nothing of a state."""
+"""Time steps after which measurements hardly change the estimate of a state."""
 
 
 class Estimator:
@@ -41,8 +41,7 @@ class Estimator:
 
     @staticmethod
     def suits(task: Task) -> bool:
-        """Only the task that it was trained for: that vessel, those injections, that model of the
-        flow."""
+        """Return True for tasks with the vessel, injections and flow model of the training."""
         known_inlet = bool(compatible_priors(HERE / "priors", task, "logarithm"))
         long_enough = task.n_steps > LAG
         return long_enough and known_inlet and network_matches_task(HERE / NETWORK, task)
@@ -63,7 +62,7 @@ class Estimator:
                 for each in zip(reduced, inputs, memories, strict=True)]
 
     def memories(self, inputs: np.ndarray, way: str) -> Iterator[np.ndarray]:
-        """(h,) of each step."""
+        """Yield the hidden state (h,) of each step."""
         memory = initial_hidden_state(self.network)
         for seen in inputs:
             memory = gru_step(self.network, seen, memory, way)

@@ -1,9 +1,9 @@
-"""Recurrent network that knows no model of the flow: from the voltages alone, learned from training
-episodes.
+"""Recurrent network that knows no model of the flow: estimation from voltages alone, trained on
+training episodes.
 
-A GRU (Cho et al. 2014) sees the voltages of each injection beside those of homogeneous fluid, and
-says the modes of the concentration, and their variances. `studies/learn.py` trains it; here it
-needs numpy alone, and the network, which is in a checkout only.
+The inputs of the GRU (Cho et al. 2014) are the deviations of the voltages from a homogeneous fluid,
+its outputs the modes of the concentration and their variances. `studies/learn.py` trains it;
+inference needs numpy and the network file, which only a checkout contains.
 """
 
 from pathlib import Path
@@ -33,7 +33,7 @@ class Estimator:
 
     @staticmethod
     def suits(task: Task) -> bool:
-        """Only the task that it was trained for: that vessel, and those injections."""
+        """Return True for tasks with the vessel and injections of the training."""
         return network_matches_task(HERE / NETWORK, task)
 
     def update(self, voltages: np.ndarray, currents: np.ndarray) -> Estimate | None:

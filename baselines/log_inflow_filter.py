@@ -1,8 +1,5 @@
-"""Extended Kalman filter of the inflow's logarithm: Gaussian, and coloured in time and across the
-inlet as in training episodes; relinearised about each prediction.
-
-With a lag it looks back over as many measurements.
-"""
+"""Extended Kalman filter of the inflow's logarithm: a Gaussian prior, correlated in time and across
+the inlet, fitted to training episodes; voltages are linearised about each prediction."""
 
 from pathlib import Path
 

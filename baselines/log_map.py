@@ -1,9 +1,9 @@
 """Maximum a posteriori for the logarithm of the concentration: nonlinear Gauss–Newton over all
 injections so far.
 
-For targets that stand still and conduct many times better or worse than what is around them, as
-metal and plastic do: nothing falls below zero. The logarithm has the prior that `map_estimate`
-gives the concentration in parts of the best homogeneous estimate.
+For stationary targets with a conductivity contrast of many times the background, such as metal and
+plastic: estimates are positive. The logarithm has the prior of the relative concentration in
+`map_estimate`.
 """
 
 import numpy as np
@@ -40,7 +40,7 @@ class Estimator:
 
 
 class LogConcentrationModel:
-    """Voltages by u = ln(c/ĉ_bh)."""
+    """Voltages as a function of u = ln(c/ĉ_bh)."""
 
     def __init__(self, observation, level: float) -> None:
         self.observation = observation

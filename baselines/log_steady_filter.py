@@ -1,8 +1,8 @@
 """Extended Kalman filter of the logarithm, for a target that stands still or moves steadily.
 
-For records of real instruments: as log_walk_filter, but what changes goes on changing for a while
-(a second-order walk that forgets, Matérn 3/2 in time) at the rate that makes some frames of the
-record likeliest. It works on the modes of the smoothness prior.
+For measurements of real instruments: as `log_walk_filter`, but the logarithm is a Matérn 3/2
+process in time, with the rate that maximises the likelihood of some frames. The state holds the
+modes of the smoothness prior and their rates of change.
 """
 
 import numpy as np

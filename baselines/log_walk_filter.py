@@ -1,8 +1,8 @@
 """Extended Kalman filter of the logarithm, for a target that stands still or walks at random.
 
-For records of real instruments, where nobody knows how a target moves, and bodies conduct many
-times better or worse than what is around them: nothing falls below zero. The logarithm walks and
-begins as `Task.prior` says of the concentration in parts of the best homogeneous estimate.
+For measurements of real instruments, with unknown motion of the target and a conductivity contrast
+of many times the background: estimates are positive. The logarithm has the initial covariance and
+walk that `Task.prior` specifies for the concentration relative to the best homogeneous estimate.
 """
 
 import numpy as np

@@ -1,8 +1,7 @@
-"""Maximum a posteriori: nonlinear Gauss–Newton over all injections so far, with the Kalman
-filter's own prior.
+"""Maximum a posteriori: nonlinear Gauss–Newton over all injections so far, with the prior of the
+Kalman filter.
 
-For targets that stand still: what the linearised filter approximates, and is to be compared with
-(thesis 7.2).
+For stationary targets, where the linearised filter approximates this estimate (thesis 7.2).
 """
 
 import numpy as np
@@ -40,7 +39,7 @@ class Estimator:
 
 
 class DeviationModel:
-    """Voltages by the deviation from the prior's mean: `gauss_newton` draws towards zero."""
+    """Voltages as a function of the deviation from the prior mean; `gauss_newton` penalises it."""
 
     def __init__(self, observation, mean: np.ndarray) -> None:
         self.observation = observation

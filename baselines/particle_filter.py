@@ -1,5 +1,5 @@
 """Rao–Blackwellised particle filter for rare slugs: a particle is a sequence of regimes, quiet or
-slug, with an extended Kalman filter; switching_inflow_filter mixes both at each step instead.
+slug, with an extended Kalman filter; `switching_inflow_filter` mixes the regimes at each step.
 """
 
 from pathlib import Path
@@ -17,9 +17,9 @@ from eitbench.estimation import (
 PRIORS = Path(__file__).with_name("priors")
 LINK = "logarithm"
 LEVEL_STD = 0.05
-"""Of the inflow between slugs, relative to the best homogeneous estimate."""
+"""Standard deviation of the inflow between slugs, relative to the best homogeneous estimate."""
 PARTICLES = 8
-"""Branching at each step, so that twice as many filters run."""
+"""Number of particles; each branches into two regimes, so that 16 filters run."""
 SEED = 0
 
 

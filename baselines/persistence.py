@@ -1,8 +1,7 @@
-"""Persistence: the stationary image of the last complete frame, held until the next frame is
+"""Persistence: the stationary reconstruction of the last complete frame, until the next frame is
 complete.
 
-Where estimates are asked for later it says what it would have said at the time: the floor for
-those who look back.
+With a lag it returns the same estimates later: a naive baseline for smoothers.
 """
 
 import numpy as np
@@ -11,7 +10,7 @@ from eitbench import Estimate, Task
 from eitbench.estimation import best_homogeneous, gauss_newton
 from eitbench.numerics.fem import stiffness_matrix
 
-ALPHA = 0.177  # that of gauss_newton.py
+ALPHA = 0.177  # as in gauss_newton.py
 
 
 class Estimator:
@@ -35,7 +34,7 @@ class Estimator:
         return Estimate(self.held[self.asked_for]) if self.asked_for >= 1 else None
 
     def image(self) -> np.ndarray:
-        """Of the frame, which begins anew."""
+        """Return the reconstruction of the frame, and begin a new frame."""
         V, I = (np.array(part) for part in zip(*self.frame, strict=True))
         self.frame = []
         task = self.task

@@ -1,6 +1,6 @@
-"""Filter that keeps pace with the instrument: flow and inflow are learned as in identified_flow,
-and the voltages are a quadratic function of the concentration's logarithm, about the level of
-training episodes.
+"""Filter that keeps pace with the instrument: flow and inflow prior as in `identified_flow`, with
+voltages as a quadratic function of the concentration's logarithm, about c_ref of the training
+episodes.
 
 A step takes less than the 5 ms between two injections, on one core.
 """
@@ -46,5 +46,5 @@ class Estimator:
 
 @lru_cache(maxsize=2)
 def quadratic(observation, model: IdentifiedModel):
-    """Made once for all episodes."""
+    """Return the quadratic voltage model, computed once for all episodes."""
     return QuadraticVoltageModel(observation, model.c_ref, model.basis)

@@ -1,5 +1,5 @@
 """Interacting multiple models for rare slugs: at each step the inflow is quiet or belongs to a
-slug, whose logarithm is Gaussian and coloured as in training episodes.
+slug; the logarithm in slugs has a coloured Gaussian prior fitted to training episodes.
 """
 
 from pathlib import Path
@@ -17,7 +17,7 @@ from eitbench.estimation import (
 PRIORS = Path(__file__).with_name("priors")
 LINK = "logarithm"
 LEVEL_STD = 0.05
-"""Of what enters between slugs, in parts of the best homogeneous estimate."""
+"""Standard deviation of the inflow between slugs, relative to the best homogeneous estimate."""
 
 
 class Estimator:

@@ -1,11 +1,9 @@
-"""Smoother with the true flow: what the best smoother of ours reaches that is told how the fluid
-moves.
+"""Smoother with the true flow: an oracle, the best built-in smoother with the true velocity field.
 
-It is shown the flow and the whole record of the episode, which is more than anyone on a board is
-given. Where something flows in, it finds the most probable inflow of the record, the inflow's
-logarithm being Gaussian and coloured as in training episodes; where nothing does, or no prior was
-learned, it is the linearised fixed-interval smoother. It is no bound: what is learned beyond such a
-prior may do better.
+It uses the true flow and all measurements of the episode, which are not available to other methods.
+With an inflow prior it computes the most probable inflow, with a coloured Gaussian prior of its
+logarithm fitted to training episodes; otherwise it is the linearised fixed-interval smoother. It is
+not a bound: methods that learn more than such a prior may have a smaller error.
 """
 
 from functools import cache
@@ -72,8 +70,8 @@ class Estimator:
 
 
 def changing_states(task: Task, transport_at, c_ref: float) -> NodalStates:
-    """The states of Table 5.1 in a flow that changes at each step; the nodal part of the noise is
-    that of the nominal flow, as in `VelocityStates`."""
+    """Return the states of Table 5.1 in a flow that changes at each step; the nodal part of the
+    noise is computed for the nominal flow, as in `VelocityStates`."""
     prior = task.prior
     nodal = task.evolution.state_noise_covariance(0.0, (c_ref * prior.nodal_std)**2)
 
@@ -91,6 +89,6 @@ def changing_states(task: Task, transport_at, c_ref: float) -> NodalStates:
 
 
 def closest(model, velocity: np.ndarray) -> np.ndarray:
-    """(T, k) parameters of the flow that come closest to the true profiles (T, p)."""
+    """Return the parameters (T, k) of the best least-squares fit to the true profiles (T, p)."""
     root = np.sqrt(model.weights)[:, None]
     return np.linalg.lstsq(root * model.profiles, root * velocity.T, rcond=None)[0].T

@@ -1,5 +1,5 @@
-"""Unscented Kalman filter of the inflow's logarithm: as log_inflow_filter, but the complete
-electrode model is evaluated at sigma points, along the principal axes of the concentration.
+"""Unscented Kalman filter of the inflow's logarithm: as `log_inflow_filter`, but with the complete
+electrode model evaluated at sigma points along the principal axes of the concentration.
 """
 
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Adjacent pairs: round-robin over neighbouring electrodes; a budget is spread evenly."""
+"""Adjacent pairs: round-robin over neighbouring electrodes; a budget is used at equal intervals."""
 
 from itertools import cycle
 from typing import Any

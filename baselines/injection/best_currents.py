@@ -1,4 +1,4 @@
-"""Best fixed currents: one for each electrode, the same at every step, the best found on training
+"""Best fixed currents: the same currents of all electrodes at every step, optimised on training
 episodes."""
 
 from typing import Any

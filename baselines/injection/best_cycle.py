@@ -1,5 +1,5 @@
-"""Best cycle: up to four pairs in turn, the best of a search on training episodes; a budget is
-spread evenly."""
+"""Best cycle: round-robin over up to four pairs, optimised on training episodes; a budget is used
+at equal intervals."""
 
 from itertools import cycle
 from typing import Any

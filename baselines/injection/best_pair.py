@@ -1,5 +1,5 @@
-"""Best fixed pair: the same one at every step, the best of all on training episodes; a budget is
-spread evenly."""
+"""Best fixed pair: the same pair at every step, the best of all pairs on training episodes; a
+budget is used at equal intervals."""
 
 from typing import Any
 

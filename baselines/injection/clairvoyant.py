@@ -1,12 +1,12 @@
-"""Clairvoyant: knows what is broken and what flows through the pipe.
+"""Clairvoyant: an oracle with the true faults and the true flow.
 
-It shows about what can be reached: it plays a few plans ahead on the very episode and then follows
-the best of them. These are greedy A-optimal among the electrodes that are sound, each of a few
-fixed pairs, the best fixed currents where each electrode may have its own, and, where there is a
-budget, injecting when its true error is large. Where the flow is unknown its variances are those
-about the true one and weigh errors by what they will do in the next steps; it tries more pairs, and
-cycles of them, and goes over from one plan to another wherever that turns out better. It is no
-bound: there are more plans, and it tries its own with the filter of reduced order.
+It indicates the achievable error: it simulates several plans on the episode itself and executes the
+best one. The plans are greedy A-optimal among the healthy electrodes, a few fixed pairs, the best
+fixed currents if actions are currents, and with a budget, injections while the true error is large.
+With an unknown velocity, variances are linearised about the truth and errors weighted by their
+effect in the next steps; the plans include more pairs and cycles, and it switches between plans
+where that reduces the error. It is not a bound: it evaluates only some of all plans, and evaluates
+them with the reduced filter.
 """
 
 from itertools import product
@@ -21,13 +21,13 @@ from eitbench.estimation.onboard.belief import Belief
 from eitbench.estimation.onboard.rules import Rules
 
 NOTHING, CURRENTS = -1, -2
-"""What plans say, beside the number of a pair, where nothing or the best currents are injected."""
+"""Entries of plans for no injection and for the best currents; other entries are pairs."""
 
 
 class Policy:
     privileged = True
     role = "reference"
-    # The cycles are for an unknown flow; those of one pair were found by
+    # The cycles are for an unknown velocity; cycles of one pair are results of
     # `python studies/search_injections.py`.
     parameters: dict[str, Any] = {  # noqa: RUF012
         "fixed_pairs": [[0, 8], [0, 10]], "thresholds": [1e-4, 3e-2, 16], "intervals": [1, 2, 3],
@@ -69,8 +69,8 @@ class Policy:
         return self.rules.action(None if number == NOTHING else number)
 
     def greedy(self, horizon: int = 0) -> np.ndarray:
-        """(steps,) pairs after which the variance is least, summed over so many steps more, of
-        electrodes without a fault."""
+        """Return the pairs (steps,) of healthy electrodes with the least posterior variance, summed
+        over the step and ``horizon`` later steps."""
         core = self.core
         seen = {name: array[0] for name, array in core.observe().items()}
         belief = Belief(self.rules, seen)
@@ -88,8 +88,8 @@ class Policy:
         return plan
 
     def changing(self) -> np.ndarray:
-        """(steps,) pairs of the best of many plans, with changes to another one after every so many
-        steps."""
+        """Return the pairs (steps,) of the best plan, which may switch at fixed intervals between
+        the candidate plans."""
         pairs = self.rules.pairs.tolist()
         steps = np.arange(self.core.length)
         options = self.parameters
@@ -104,10 +104,10 @@ class Policy:
 
     def ahead(self, plans: np.ndarray, threshold: np.ndarray | None = None,
               interval: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
-        """Play plans (B, steps) side by side: mean errors (B,) and what was injected (B, steps).
+        """Roll out plans (B, steps); return mean errors (B,) and executed plans (B, steps).
 
-        With a ``threshold`` (B,) nothing is injected while the true error lies below, nor before
-        the ``interval`` (B,) from the last injection is over.
+        With a ``threshold`` (B,), nothing is injected while the true error is below it, or within
+        the ``interval`` (B,) after the last injection.
         """
         twin = InjectionCore(self.rules, "reduced")
         plans = plans.copy()

@@ -1,8 +1,6 @@
-"""Event-triggered: probes now and then, and looks closely while what it reads is not what was
-predicted.
+"""Event-triggered: injects at long intervals, and at short intervals while innovations are large.
 
-What is left of the budget is spread over what is left of the episode; a part is kept back for
-surprises.
+The remaining budget is distributed over the remaining steps, with a reserve for large innovations.
 """
 
 from typing import Any
@@ -31,9 +29,9 @@ class Policy:
         self.belief = Belief.create_or_update(self.belief, self.rules, observation)
         if observation["currents"].any():
             self.waited = 0
-            # In predicted standard deviations: 0.4 to 0.6 in quiet fluid, which does less than the
-            # model expects. What rises above that is a slug's front; as long as it is not
-            # understood, innovations are large.
+            # In predicted standard deviations: 0.4 to 0.6 without a slug, since the model assumes
+            # more variation. Larger innovations occur at the front of a slug, until the filter has
+            # estimated it.
             surprise = float(np.sqrt(np.mean(observation["innovations"]**2)))
             self.alarmed = surprise > self.parameters["calm" if self.alarmed else "alarm"]
         self.waited += 1

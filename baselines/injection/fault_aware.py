@@ -1,5 +1,4 @@
-"""Fault-aware greedy: A-optimal among the electrodes that recent readings give no reason to
-doubt."""
+"""Fault-aware greedy: A-optimal among the electrodes with a low fault score."""
 
 from typing import Any
 

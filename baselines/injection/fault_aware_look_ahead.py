@@ -1,5 +1,5 @@
-"""Fault-aware look-ahead: beam search over the next three injections, among the electrodes that
-are not in doubt."""
+"""Fault-aware look-ahead: beam search over the next three injections, among the electrodes with a
+low fault score."""
 
 from typing import Any
 

@@ -1,10 +1,10 @@
-"""Foresighted: the pair that leaves least variance where and when it will count; a budget is spread
-evenly.
+"""Foresighted: the pair with the least future variance in the scored region; a budget is used at
+equal intervals.
 
-A-optimal for what the fluid brings: the flow carries what is uncertain now, and what of it lies in
-the region of interest is summed over the next steps. Where the flow is unknown a pair that was
-injected rests for a while: the filter is surer of the velocity than it should be, and other pairs
-show where it is wrong.
+The A-criterion weights present errors by their contribution, after advection, to the variance in
+the region of interest over the next steps. With an unknown velocity a pair is not repeated for
+some steps: the filter underestimates the uncertainty of the velocity, and other pairs reveal its
+error.
 """
 
 from typing import Any
@@ -16,7 +16,7 @@ from eitbench.estimation.onboard.rules import Rules
 
 
 class Policy:
-    # Of a few values tried the best on the episodes train:0-11 of Pipe2DInjectionFlow.
+    # The best of a few values on the episodes train:0-11 of Pipe2DInjectionFlow.
     parameters: dict[str, Any] = {"steps": 4, "rest": 20}  # noqa: RUF012
 
     def __init__(self, rules: Rules, random: np.random.Generator) -> None:
@@ -30,7 +30,7 @@ class Policy:
         self.belief = belief = Belief.create_or_update(self.belief, self.rules, observation)
         if not self.rules.is_injection_step(observation["left"]):
             return self.rules.action(None)
-        # The next measurement's state lies one step ahead; after the episode's end nothing counts.
+        # The next measurement is one step ahead; errors after the episode's end are not scored.
         steps = min(self.parameters["steps"], int(observation["left"][0]) - 1)
         criterion = belief.design_criteria(belief.predict_covariance(),
                                            weight=belief.future_error_weight(steps))[0]

@@ -1,5 +1,5 @@
-"""Greedy, A-optimal: the pair that leaves the least variance, linear about the estimate; a budget
-is spread evenly."""
+"""Greedy, A-optimal: the pair with the least posterior variance, linearised about the estimate; a
+budget is used at equal intervals."""
 
 from typing import Any
 

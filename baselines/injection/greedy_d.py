@@ -1,5 +1,5 @@
-"""Greedy, D-optimal: the pair that tells most bits, linear about the estimate; a budget is spread
-evenly."""
+"""Greedy, D-optimal: the pair with the largest information gain, linearised about the estimate; a
+budget is used at equal intervals."""
 
 from typing import Any
 

@@ -1,5 +1,5 @@
 """Look-ahead: beam search over the next three injections for the least sum of variances; a budget
-is spread evenly."""
+is used at equal intervals."""
 
 from typing import Any
 

@@ -1,4 +1,4 @@
-"""Opposite pairs: round-robin straight across the vessel; a budget is spread evenly."""
+"""Opposite pairs: round-robin over opposite electrodes; a budget is used at equal intervals."""
 
 from itertools import cycle
 from typing import Any

@@ -1,4 +1,4 @@
-"""Random pair: any of all pairs, each with the same probability; a budget is spread evenly."""
+"""Random pair: uniformly distributed over all pairs; a budget is used at equal intervals."""
 
 from typing import Any
 

@@ -1,8 +1,8 @@
-"""Offline schedule: every injection chosen beforehand, for the least variances by the model alone.
+"""Offline schedule: all injections are optimised in advance, for the least predicted variances.
 
-Greedy first, then, step by step, exchange for a better one; where there is a budget injections move
-in time, too. The variances of the model do not depend on what will be measured; where the flow is
-unknown, or voltages are linearised anew about each prediction, they do.
+The schedule is greedy at first; then injections are exchanged step by step, and with a budget also
+moved in time. The predicted variances do not depend on the measurements, unless the velocity is
+unknown or voltages are linearised about each prediction.
 """
 
 from functools import lru_cache
@@ -14,11 +14,11 @@ from eitbench.estimation.onboard.belief import Belief
 from eitbench.estimation.onboard.rules import Rules
 
 CANDIDATES = 6
-"""Pairs that are tried at a step."""
+"""Number of candidate pairs at a step."""
 SWEEPS = 2
-"""How often all steps are gone through."""
+"""Number of sweeps over all steps."""
 AFTERWARDS = 16
-"""Steps on which an exchange is judged."""
+"""Number of steps over which an exchange is evaluated."""
 
 
 class Policy:
@@ -39,12 +39,12 @@ class Policy:
 
 @lru_cache(maxsize=8)
 def plan_of(rules: Rules) -> tuple[int | None, ...]:
-    """The pair of each step, None for no injection."""
+    """Return the pair of each step, None for no injection."""
     belief = Belief.from_prior(rules)
     steps = rules.world.n_steps - len(rules.world.currents)
     plan: list[int | None] = [-1 if rules.is_injection_step(np.array([steps - k])) else None
                               for k in range(steps)]
-    # Before each step; None is the one after the first frame.
+    # Covariances before each step; None is the covariance after the first frame.
     states: list[np.ndarray | None] = [None] * (steps + 1)
 
     def follow(covariance: np.ndarray | None, pair: int | None) -> np.ndarray:

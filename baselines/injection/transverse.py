@@ -1,4 +1,4 @@
-"""Transverse pairs: round-robin aslant across the pipe; a budget is spread evenly."""
+"""Transverse pairs: round-robin over diagonal pairs; a budget is used at equal intervals."""
 
 from itertools import cycle
 from typing import Any
@@ -8,7 +8,7 @@ import numpy as np
 from eitbench.estimation.onboard.rules import Rules
 
 DOWN = 3
-"""Electrodes by which the current leaves further down than it enters."""
+"""Downstream offset of the sink electrode, in electrodes."""
 
 
 class Policy:

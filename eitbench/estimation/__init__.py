@@ -1,4 +1,4 @@
-"""Estimators: filters, smoothers and reconstructions; matrices in, estimates out."""
+"""Estimators: filters, smoothers and reconstructions, on matrices and voltage models."""
 
 from eitbench.estimation.correction import (
     FilterFeatures,

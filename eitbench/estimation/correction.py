@@ -1,8 +1,7 @@
-"""Recurrent networks that say by how much an estimate is off (``docs/learn.md``): what plays them,
-in numpy alone.
+"""Recurrent networks that correct estimates: inference in numpy (``docs/learn.md``).
 
-A network is a file of plain arrays. It works in modes B of c/ĉ_bh − 1: from what is seen of a step
-it says a correction of the modes, and the variance of each.
+A network is a file of plain arrays. It works in modes B of c/ĉ_bh − 1: from the features of a time
+step it predicts a correction of the modes and the variance of each corrected mode.
 """
 
 from __future__ import annotations
@@ -29,14 +28,14 @@ Network = Mapping[str, np.ndarray]
 
 @lru_cache(maxsize=4)
 def load_network(path: Path) -> dict[str, np.ndarray]:
-    """The arrays of a network, in double precision."""
+    """Return the arrays of a network in double precision."""
     with np.load(path) as file:
         return {name: file[name].astype(float) for name in file.files}
 
 
 def network_matches_task(path: Path, task: Task) -> bool:
-    """Whether the network at ``path`` is there and was trained for this vessel, these injections
-    and this model of the flow."""
+    """Return whether the network at ``path`` exists and was trained for this vessel, these
+    injections and this flow model."""
     if not path.is_file():
         return False
     known = load_network(path)
@@ -52,9 +51,9 @@ def network_matches_task(path: Path, task: Task) -> bool:
 
 def gru_step(network: Network, inputs: np.ndarray, hidden_state: np.ndarray,
              direction: str = "") -> np.ndarray:
-    """The new hidden state (h,) of a gated recurrent unit (Cho et al. 2014).
+    """Return the new hidden state (h,) of a gated recurrent unit (Cho et al. 2014).
 
-    ``inputs`` (d,) are raw; ``direction`` is ``"backward_"`` of the unit that reads from the end.
+    ``inputs`` (d,) are not scaled; ``direction`` is ``"backward_"`` for the backward unit.
     """
     inputs = inputs / network["input_scale"]
     seen = network[f"{direction}input_weight"] @ inputs + network[f"{direction}input_bias"]
@@ -67,9 +66,9 @@ def gru_step(network: Network, inputs: np.ndarray, hidden_state: np.ndarray,
 
 
 def network_output(network: Network, inputs: np.ndarray,
-         hidden_state: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The correction (q,) and its variance (q,): linear in the hidden state, or in those
-    of both directions, and linear maps of the inputs (d,) that the hidden state mixes."""
+                   hidden_state: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the correction (q,) and its variance (q,): a linear map of the hidden state (of both
+    directions), plus linear maps of the inputs (d,) with weights from the hidden state."""
     inputs = inputs / network["input_scale"]
     told = network["output_weight"] @ hidden_state + network["output_bias"]
     correction, log_variance = np.split(told, 2)
@@ -80,13 +79,13 @@ def network_output(network: Network, inputs: np.ndarray,
 
 
 def initial_hidden_state(network: Network) -> np.ndarray:
-    """(h,) the hidden state before anything is seen."""
+    """Return the hidden state (h,) before the first input."""
     return np.zeros(network["hidden_weight"].shape[1])
 
 
 def apply_correction(network: Network, c_ref: float, reduced: np.ndarray, inputs: np.ndarray,
-              hidden_state: np.ndarray) -> Estimate:
-    """ĉ_bh (1 + B (a + Δ)) of the modes a = ``reduced`` (q,), and its variance."""
+                     hidden_state: np.ndarray) -> Estimate:
+    """Return ĉ_bh (1 + B (a + Δ)) and its variance, for the modes a = ``reduced`` (q,)."""
     basis = network["basis"]
     correction, variance = network_output(network, inputs, hidden_state)
     mean = 1.0 + basis @ (reduced + correction)
@@ -98,25 +97,25 @@ def _sigmoid(x: np.ndarray) -> np.ndarray:
     return 1.0 / (1.0 + np.exp(-x))
 
 
-# -- what it sees ----------------------------------------------------------------------------------
+# -- features --------------------------------------------------------------------------------------
 
 
 class FilterFeatures:
-    """What a network sees of an episode from the `InflowWindow`.
+    """Features of an episode from the filter of the `InflowWindow`.
 
     Parameters
     ----------
     task : Task
     prior : InflowPrior
-        Of the task's inlet.
+        Prior for the task's inlet.
     c_ref : float
         ĉ_bh in mol/m³.
     basis : (n, q)
         Modes of c/ĉ_bh − 1.
     lag : int
-        The oldest state that is asked for, in steps before the present one.
+        Lag of the oldest requested state, in time steps.
     model : IdentifiedModel, optional
-        With it, the filter is that of `baselines/identified_flow.py`.
+        Model of the filter, as in `baselines/identified_flow.py`.
     """
 
     def __init__(self, task: Task, prior: InflowPrior, c_ref: float, basis: np.ndarray,
@@ -128,9 +127,9 @@ class FilterFeatures:
                                     iterated=model is not None)
 
     def __call__(self, voltages: np.ndarray, currents: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Inputs (d,), and what the filter thinks after this measurement (q,): the innovation in
-        parts of the noise, the filter's modes, what has changed in them, and which injection it
-        is."""
+        """Return the inputs (d,) and the filter's modes (q,) after this measurement vector: inputs
+        are the innovation relative to the noise, the modes, their change by the update, and the
+        one-hot code of the injection."""
         step = self.filter.assimilate(voltages, currents)
         before = self._modes(self.filter.space.concentration(step.predicted_mean))
         innovation = step.innovation
@@ -140,7 +139,7 @@ class FilterFeatures:
                                injection_one_hot(self.task, currents)]), after
 
     def modes(self, lag: int = 0) -> np.ndarray:
-        """(q,) of the filter's mean, ``lag`` steps ago."""
+        """Return the modes (q,) of the filter's mean ``lag`` steps ago."""
         return self._modes(self.filter.space.concentration(self.filter.mean, lag))
 
     def _modes(self, concentration: np.ndarray) -> np.ndarray:
@@ -148,8 +147,8 @@ class FilterFeatures:
 
     def record(self, record: Sequence[Measurement],
                *lags: int) -> tuple[np.ndarray, list[np.ndarray]]:
-        """Of T measurements, (L,) in V and in A each: the inputs (T, d), and for each of ``lags``
-        what the filter thinks of each state so many measurements later, or at the end (T, q)."""
+        """Return the inputs (T, d) of T measurement vectors, and for each of ``lags`` the modes
+        (T, q) of each state, as estimated that many steps later or at the end."""
         inputs = []
         modes: list[list[np.ndarray]] = [[] for _ in lags]
         for t, (voltages, currents) in enumerate(record):
@@ -163,7 +162,7 @@ class FilterFeatures:
 
 
 class VoltageFeatures:
-    """What a network sees of an episode from voltages alone; parameters as of `FilterFeatures`."""
+    """Features of an episode from voltages alone; parameters as for `FilterFeatures`."""
 
     def __init__(self, task: Task, c_ref: float, basis: np.ndarray) -> None:
         self.task = task
@@ -172,30 +171,30 @@ class VoltageFeatures:
         self.none = np.zeros(basis.shape[1])
 
     def __call__(self, voltages: np.ndarray, currents: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Inputs (frame·L,), zero but for this injection's: where the voltages lie beside those of
-        homogeneous fluid, in parts of the noise; and modes (q,) of homogeneous fluid, zero."""
+        """Return the inputs (frame·L,), deviations of the voltages from a homogeneous fluid
+        relative to the noise, zero for other injections, and zero modes (q,)."""
         here = injection_one_hot(self.task, currents)
         expected = here @ self.expected
         off = (voltages - expected) / self.task.noise.std(expected)
         return np.outer(here, off).ravel(), self.none
 
 
-# -- from the first measurement to the last --------------------------------------------------------
+# -- estimators ------------------------------------------------------------------------------------
 
 
 class NetworkCorrectedFilter:
-    """Filter that a network corrects, for `FilterEstimator`.
+    """Filter with a network correction, for `FilterEstimator`.
 
     After the last measurement, when the lag shrinks, it returns the estimates of the filter alone.
 
     Parameters
     ----------
     network : mapping
-        As `load_network` returns it.
+        As returned by `load_network`.
     seen : FilterFeatures or VoltageFeatures
         Inputs of the network; `VoltageFeatures` has no lag.
     lag : int
-        Of the task.
+        Lag of the task in time steps.
     """
 
     def __init__(self, network: Network, seen: FilterFeatures | VoltageFeatures, c_ref: float,
@@ -208,7 +207,7 @@ class NetworkCorrectedFilter:
         self._measured = 0
 
     def assimilate(self, voltages: np.ndarray, currents: np.ndarray) -> None:
-        """Show the network one more measurement, (L,) in V and in A."""
+        """Pass one measurement vector, (L,) in V and in A, to the network."""
         inputs, reduced = self.seen(voltages, currents)
         self._measured += 1
         if self.lag and isinstance(self.seen, FilterFeatures):
@@ -236,5 +235,5 @@ def network_estimator(
 
 
 def injection_one_hot(task: Task, currents: np.ndarray) -> np.ndarray:
-    """(frame,) one for this injection of the task's cycle, zero for the others."""
+    """Return (frame,) one for this injection of the task's cycle, zero for the others."""
     return (task.currents == currents).all(axis=1).astype(float)

@@ -12,9 +12,9 @@ from scipy.linalg import blas
 from eitbench import _check
 
 _BLOCK = 128
-"""columns copied at once when a triangle is mirrored: small enough for the processor's cache"""
+"""Number of columns copied at once when a triangle is mirrored; a block fits the CPU cache."""
 _PANEL = 64
-"""columns passed to a callable transition at once: they fit the cache, few calls are made"""
+"""Number of columns passed to a callable transition at once; a panel fits the CPU cache."""
 
 Transition = np.ndarray | Callable[[np.ndarray], np.ndarray]
 """F (n, n), or X (n, k) -> F X."""
@@ -23,8 +23,8 @@ Transition = np.ndarray | Callable[[np.ndarray], np.ndarray]
 class Covariance(Protocol):
     """Covariance P (n, n) of a state in one of several forms.
 
-    `propagate` and `subtract` return the covariance to go on with: the dense form changes in place,
-    the low-rank form leaves what it was.
+    `propagate` and `subtract` return the new covariance: the dense form changes in place, the
+    low-rank form is immutable.
     """
 
     @property
@@ -42,7 +42,7 @@ class Covariance(Protocol):
         """Return P − G Gᵀ, with G (n, m)."""
 
     def copy(self) -> Self:
-        """Return a covariance that changes on its own."""
+        """Return an independent copy."""
 
     def diagonal(self) -> np.ndarray:
         """Return the variances (n,)."""
@@ -52,9 +52,9 @@ class Covariance(Protocol):
 
 
 class DenseCovariance:
-    """Covariance kept as a symmetric matrix P (n, n), written in place.
+    """Covariance stored as a symmetric matrix P (n, n), modified in place.
 
-    It serves transitions that change, F = I and windows. The diagonal is kept from falling below
+    It supports time-varying transitions, F = I and windows. Negative diagonal entries are set to
     zero. ``ValueError`` if the matrix is not square or not finite.
     """
 
@@ -70,7 +70,7 @@ class DenseCovariance:
         return self._array
 
     def copy(self) -> Self:
-        """Return a covariance that changes on its own."""
+        """Return an independent copy."""
         return type(self)(self._array)
 
     def times(self, X: np.ndarray) -> np.ndarray:
@@ -80,8 +80,8 @@ class DenseCovariance:
     def propagate(self, transition: Transition | None, noise: np.ndarray | None = None) -> Self:
         """Return F P Fᵀ + Q, in place; None: F = I, Q = 0.
 
-        A callable pays where F X costs far less than a product of full matrices, such as solves
-        with a sparse matrix: it is called twice for n columns.
+        A callable is faster where F X costs far less than a product of dense matrices, such as
+        solves with a sparse matrix: it is called twice for n columns.
         """
         if callable(transition):
             self._transform_by_columns(transition)
@@ -94,8 +94,8 @@ class DenseCovariance:
     def shift(self, weights: np.ndarray, new_variance: np.ndarray) -> Self:
         """Advance a window of W values of d numbers each, the newest first, by one time step.
 
-        Each number follows from its own past by ``weights`` (W, d) or (W, 1) and an independent
-        part of variance ``new_variance`` (d,); the oldest value is dropped.
+        Each number is the sum of its past values, weighted by ``weights`` (W, d) or (W, 1), and
+        independent noise of variance ``new_variance`` (d,); the oldest value is dropped.
         """
         P = self._array
         d = len(new_variance)
@@ -114,7 +114,7 @@ class DenseCovariance:
         """Return P − G Gᵀ, with G (n, m), in place."""
         self._array -= np.matmul(root, root.T, out=self._scratch())
         diagonal = np.einsum("ii->i", self._array)                                      # a view
-        np.maximum(diagonal, 0.0, out=diagonal)  # precise measurements leave rounding of any sign
+        np.maximum(diagonal, 0.0, out=diagonal)  # rounding may make small variances negative
         return self
 
     def diagonal(self) -> np.ndarray:
@@ -137,14 +137,14 @@ class DenseCovariance:
         diagonal = np.einsum("ii->i", P)
         diagonal *= 0.5
         np.copyto(B, F)
-        # BLAS is column-major and sees arrays transposed: Lᵀ Fᵀ, from the lower triangle of Pᵀ.
+        # BLAS is column-major and reads arrays transposed: Lᵀ Fᵀ, from the lower triangle of Pᵀ.
         blas.dtrmm(1.0, P.T, B.T, lower=1, trans_a=1, overwrite_b=1)
         blas.dsyr2k(1.0, np.asfortranarray(F.T), B.T, beta=0.0, c=P.T, trans=1, lower=1,
                     overwrite_c=1)
         _mirror(P)
 
     def _transform_by_columns(self, apply: Callable[[np.ndarray], np.ndarray]) -> None:
-        """P ← F P Fᵀ as F (F P)ᵀ, of which the upper triangle is kept."""
+        """P ← F P Fᵀ as F (F P)ᵀ; only the upper triangle is used."""
         P, B = self._array, self._scratch()
         panels = [slice(begin, begin + _PANEL) for begin in range(0, len(P), _PANEL)]
         for panel in panels:
@@ -165,15 +165,14 @@ def _mirror(P: np.ndarray) -> None:
 class OpenLoopCovariance:
     """Covariance Π_t, t = 0, 1, …, without measurements: Π⁺ = F Π Fᵀ + Q.
 
-    Π_t depends on no data, so it is computed once and shared by all episodes. It is kept as Π_t =
-    Π_∞ + U D Uᵀ with D = diag(±1): what is left of the initial covariance, U ← F U, loses rank
-    quickly because the flow carries it away and diffusion smooths it. ``ValueError`` if Π_t has no
-    limit.
+    Π_t does not depend on data, so it is computed once and shared by all episodes. It is stored as
+    Π_t = Π_∞ + U D Uᵀ with D = diag(±1): the remainder of the initial covariance, U ← F U, loses
+    rank quickly because of advection and diffusion. ``ValueError`` if Π_t has no limit.
 
     Parameters
     ----------
     transition : (n, n)
-        F, with spectral radius below one (or F = I without noise, for a target that stands still).
+        F, with spectral radius below one (or F = I without noise, for a stationary target).
     noise : (n, n)
         Γ_w.
     initial : (n, n), optional
@@ -195,22 +194,22 @@ class OpenLoopCovariance:
         self._transients = [left]  # (U, D) at t = 0, 1, …
 
     def scaled(self, factor: float) -> OpenLoopCovariance:
-        """The same sequence times ``factor``, sharing all matrices."""
+        """Return the same sequence times ``factor``, sharing all matrices."""
         other = object.__new__(OpenLoopCovariance)
         other.__dict__ = self.__dict__ | {"scale": self.scale * factor}
         return other
 
     def apply(self, t: int, X: np.ndarray) -> np.ndarray:
-        """Π_t X for X (n, k)."""
+        """Return Π_t X for X (n, k)."""
         U, signs = self._transient(t)
         return self.scale * (self.limit @ X + U @ (signs[:, None] * (U.T @ X)))
 
     def apply_noise(self, X: np.ndarray) -> np.ndarray:
-        """Γ_w X for X (n,) or (n, k)."""
+        """Return Γ_w X for X (n,) or (n, k)."""
         return self.scale * (self._noise @ X)
 
     def diagonal(self, t: int) -> np.ndarray:
-        """The variances Π_t holds, (n,)."""
+        """Return the variances (n,) of Π_t."""
         U, signs = self._transient(t)
         return self.scale * (self.limit.diagonal() + (U**2) @ signs)
 
@@ -227,18 +226,18 @@ class OpenLoopCovariance:
 
 
 class LowRankCovariance:
-    """Covariance P_t = Π_t − Z Zᵀ: few readings of a large state, without n×n products.
+    """Covariance P_t = Π_t − Z Zᵀ: few measurements of a large state, without n×n products.
 
-    Measurements add columns to Z (n, r), which moves with F and is truncated to its numerical rank,
-    far below n (``docs/methods.md``, 5).
+    Measurements add columns to Z (n, r), which is propagated by F and truncated to its numerical
+    rank, far below n (``docs/methods.md``, 5).
 
     Parameters
     ----------
     open_loop : OpenLoopCovariance
         Π_t; Π_0 is the initial covariance.
     rank_tolerance : float
-        Directions of Z shorter than this fraction of its longest are dropped; the covariance loses
-        the square of it.
+        Singular values of Z below this fraction of the largest are dropped; the relative error of
+        the covariance is its square.
     """
 
     def __init__(self, open_loop: OpenLoopCovariance, rank_tolerance: float = 1e-6, *,
@@ -255,11 +254,11 @@ class LowRankCovariance:
 
     @property
     def array(self) -> np.ndarray:
-        """(n, n) P, computed anew."""
+        """(n, n) P, recomputed at each access."""
         return self.times(np.eye(len(self.assimilated)))
 
     def copy(self) -> Self:
-        """Return the same: it never changes."""
+        """Return the object itself, which is immutable."""
         return self
 
     def times(self, X: np.ndarray) -> np.ndarray:
@@ -295,7 +294,7 @@ def truncate_columns(Z: np.ndarray, tolerance: float) -> np.ndarray:
 
 
 def _stationary(F: np.ndarray, noise: np.ndarray) -> np.ndarray:
-    """The solution of Π = F Π Fᵀ + Γ_w, by doubling the number of steps until nothing is added."""
+    """Return the solution of Π = F Π Fᵀ + Γ_w, by doubling the number of steps to convergence."""
     total = noise
     power = F
     for _ in range(40):
@@ -312,7 +311,7 @@ def _stationary(F: np.ndarray, noise: np.ndarray) -> np.ndarray:
 
 
 def _signed_factor(symmetric: np.ndarray, threshold: float) -> tuple[np.ndarray, np.ndarray]:
-    """(U, D) with U diag(D) Uᵀ = symmetric up to eigenvalues of ``threshold``, D = ±1."""
+    """Return (U, D) with U diag(D) Uᵀ = symmetric up to eigenvalues of ``threshold``, D = ±1."""
     values, vectors = np.linalg.eigh(0.5 * (symmetric + symmetric.T))
     keep = np.abs(values) > threshold
     return vectors[:, keep] * np.sqrt(np.abs(values[keep])), np.sign(values[keep])

@@ -1,7 +1,7 @@
-"""Which injection teaches most: optimal design for a Gaussian state, over all pairs at once.
+"""Optimal design of the next injection for a Gaussian state, for all electrode pairs at once.
 
-The voltages are bilinear in the pair that drives and the electrode that is read, so one table of
-products of the covariance serves every pair (``docs/methods.md``, 8).
+The voltages are bilinear in the driving pair and the measuring electrode, so one table of products
+of the covariance serves every pair (``docs/methods.md``, 8).
 """
 
 from __future__ import annotations
@@ -12,22 +12,22 @@ import numpy as np
 def pair_design_criteria(
         voltage_covariance: np.ndarray, weighted_voltage_covariance: np.ndarray,
         pairs: np.ndarray, noise_variance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """What each pair would teach if it were injected now, (p,) and (p,).
+    """Return the A- and D-criterion of an injection through each pair, (p,) and (p,).
 
-    By how much tr(W P) falls (A-optimality), and ½ ln by what factor det P does (D-optimality).
-    With D the derivatives of the voltages under a current into one electrode, (L, L, n) for n
-    states, read as L² rows:
+    They are the reduction of tr(W P) (A-optimality) and half the reduction of ln det P
+    (D-optimality). D holds the derivatives of the voltages for a current into one electrode,
+    (L, L, n) for n states, as L² rows.
 
     Parameters
     ----------
     voltage_covariance : (L, L, L, L)
-        D P Dᵀ, P the state's covariance just before the measurement.
+        D P Dᵀ, with the state's covariance P just before the measurement.
     weighted_voltage_covariance : (L, L, L, L)
-        D P W P Dᵀ, W the weight of the states' errors.
+        D P W P Dᵀ, with the weight W of state errors.
     pairs : (p, 2)
-        Where the current enters and leaves.
+        Electrodes where the current enters and leaves.
     noise_variance : (p, L)
-        Of each pair's voltages, per current squared; infinite for readings not to be believed.
+        Noise of each pair's voltages, per current squared; infinite for rejected measurements.
     """
     i, j = pairs.T
     L = voltage_covariance.shape[0]
@@ -35,8 +35,7 @@ def pair_design_criteria(
     def between(table: np.ndarray) -> np.ndarray:
         return table[i, :, i] - table[i, :, j] - table[j, :, i] + table[j, :, j]
 
-    # In parts of the noise; a reading without end to its noise has no part in it.
-    root = 1.0 / np.sqrt(noise_variance)
+    root = 1.0 / np.sqrt(noise_variance)              # zero for rejected measurements
     S = between(voltage_covariance) * root[:, :, None] * root[:, None, :]
     S[:, np.arange(L), np.arange(L)] += 1.0
     factor = np.linalg.cholesky(S)

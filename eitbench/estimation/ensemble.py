@@ -1,5 +1,4 @@
-"""An ensemble of inflows, flows and concentrations instead of a covariance
-(``docs/methods.md``, 14)."""
+"""Ensemble Kalman filter of inflows, flows and concentrations (``docs/methods.md``, 14)."""
 
 from __future__ import annotations
 
@@ -19,34 +18,34 @@ if TYPE_CHECKING:
     from eitbench.worlds.task import Task
 
 QUADRATURE_NODE = 3.0**0.5
-"""Standard deviations of θ about its mean at which the transport is computed: Gauss–Hermite's."""
+"""Distance of the outer Gauss–Hermite nodes from the mean of θ, in standard deviations."""
 
 
 class EnsembleFilter:
-    """The ensemble Kalman filter of (c, x, θ): concentration, last inflows and flow.
+    """Ensemble Kalman filter of (c, x, θ): concentration, last inflows and velocity parameters.
 
-    Each member's inflow goes on by the prior's regression and its flow by a random walk; the fluid
-    moves with the member's own θ, by quadratic interpolation of the step between transports at the
-    mean θ and `QUADRATURE_NODE` standard deviations off it along each axis. A measurement is
-    linearised about the mean concentration and moves mean and deviations by the symmetric square
-    root (Hunt, Kostelich & Szunyogh, Physica D 230, 2007), without perturbed measurements.
+    Each member's inflow follows the prior's regression, and its θ a random walk; each member is
+    advected with its own θ, by quadratic interpolation of the step between transports at the mean θ
+    and at `QUADRATURE_NODE` standard deviations on both sides along each axis. A measurement vector
+    is linearised about the mean concentration and updates mean and deviations by the symmetric
+    square root (Hunt, Kostelich & Szunyogh, Physica D 230, 2007), without perturbed measurements.
 
     The velocity of each member stays within the flow's bounds. ``ValueError`` naming the argument
-    if it is out of range, or the prior is of another inlet.
+    if it is out of range, or if the prior is for another inlet.
 
     Parameters
     ----------
     task : Task
     prior : InflowPrior
-        Of the task's inlet.
+        Prior for the task's inlet.
     c_ref : float
-        ĉ_bh in mol/m³, which fills the pipe before the first of the inflows.
+        ĉ_bh in mol/m³, the concentration in the pipe before the first inflow.
     flow : VelocityPrior
-        Numbers of zero deviation are known.
+        Parameters with zero standard deviation are fixed.
     members : int
         N ≥ 2.
     spin_up_steps : int
-        Time steps that the members' inflows have flowed before t = 0, ≥ 0.
+        Time steps of inflow before t = 0, ≥ 0.
     random : Generator
     forward : callable
         Linearises voltages about a concentration; for `assimilate`.
@@ -78,7 +77,7 @@ class EnsembleFilter:
             self._advance(0.0 * flow.walk_std)
 
     def predict(self) -> None:
-        """Move each member one time step on, with an inflow and a flow of its own."""
+        """Advance each member one time step, with its own inflow and velocity."""
         self._advance(self.flow.walk_std)
 
     def _advance(self, walk_std: np.ndarray) -> None:
@@ -92,15 +91,15 @@ class EnsembleFilter:
         self.concentration = self._carried(before, self._inflow())
 
     def _drawn(self, mean: np.ndarray, std: np.ndarray, N: int) -> np.ndarray:
-        """(k, N) about ``mean``, which may be (k, 1)."""
+        """Return samples (k, N) about ``mean``, (k, N) or (k, 1)."""
         return mean + std[:, None] * self._random.standard_normal((len(std), N))
 
     def _inflow(self) -> np.ndarray:
-        """(n_inlet, N) mol/m³ that enters now."""
+        """Return the present inflow (n_inlet, N) in mol/m³."""
         return self.c_ref * self.prior.inverse_link(self.prior.modes @ self.inflows[0])
 
     def _carried(self, before: np.ndarray, after: np.ndarray) -> np.ndarray:
-        """(n, N) of each member in a flow of its own, one time step later."""
+        """Return the concentrations (n, N) one time step later, each in its member's velocity."""
 
         def moved(theta: np.ndarray) -> np.ndarray:
             return self.flow.transport_at(theta).step(self.concentration, before, after)
@@ -131,7 +130,7 @@ class EnsembleFilter:
         mean = seen.mean(axis=1)
         seen -= mean[:, None]
         innovation = observation.value - mean
-        # (I + Sᵀ S)⁻¹ and its root, of the deviations in parts of the noise, S = U diag(s) Vᵀ
+        # (I + Sᵀ S)⁻¹ and its root, with the deviations S = U diag(s) Vᵀ relative to the noise
         S = seen / std[:, None] / np.sqrt(N - 1.0)
         U, s, Vt = np.linalg.svd(S, full_matrices=False)
         moves = Vt.T @ (s / (1.0 + s**2) * (U.T @ (innovation / std))) / np.sqrt(N - 1.0)
@@ -144,7 +143,7 @@ class EnsembleFilter:
                             seen @ seen.T / (N - 1.0) + np.diag(observation.noise_variance))
 
     def _keep_physical(self) -> None:
-        """Move each member's θ back within the bounds."""
+        """Project each member's θ onto the bounds."""
         for member in self.parameters.T:
             member[:] = self.flow.within_bounds(member)
 

@@ -1,4 +1,4 @@
-"""Estimators made of filters and smoothers: from the calibration frame to the last measurement."""
+"""Estimators based on filters and smoothers, from the calibration frame to the last measurement."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ Measurement = tuple[np.ndarray, np.ndarray]
 
 
 class CalibrationFrame:
-    """Calibration frame: the first injections, which determine ĉ_bh and with it all of Table 5.1.
+    """Calibration frame: the first injections, which determine ĉ_bh, the scale of Table 5.1.
 
-    The frame lies within the warm-up, so that no scored estimate waits for it.
+    The frame is within the warm-up, so that it delays no scored estimate.
     """
 
     def __init__(self, task: Task) -> None:
@@ -25,11 +25,11 @@ class CalibrationFrame:
         self.length = task.calibration
         self.measurements: list[Measurement] = []
         self.c_ref = task.expected_concentration
-        """mol/m³; the task's rough level until the frame is complete, then ĉ_bh"""
+        """mol/m³; the task's expected concentration until the frame is complete, then ĉ_bh"""
 
     @property
     def complete(self) -> bool:
-        """Whether the whole frame has been measured."""
+        """True once the whole frame has been measured."""
         return len(self.measurements) >= self.length
 
     def add(self, voltages: np.ndarray, currents: np.ndarray) -> bool:
@@ -44,7 +44,7 @@ class CalibrationFrame:
 
     @property
     def mean(self) -> np.ndarray:
-        """(n,) homogeneous concentration: the estimate while the frame lasts."""
+        """(n,) homogeneous concentration: the estimate during the frame."""
         return np.full(self.task.mesh.n_nodes, self.c_ref)
 
 
@@ -52,17 +52,17 @@ class Sequential(Protocol):
     """Filter that assimilates one measurement at a time, such as `Filter`."""
 
     def assimilate(self, voltages: np.ndarray, currents: np.ndarray) -> Any:
-        """Advance one time step and use its measurement."""
+        """Advance one time step and use its measurement vector."""
 
     def estimate(self, lag: int = 0) -> Estimate:
         """Return the state ``lag`` steps before the present."""
 
 
 class FilterEstimator:
-    """Filter as an estimator of each state, ``task.lag`` measurements later.
+    """Estimator that returns each state of a filter with a lag of ``task.lag`` time steps.
 
-    During the calibration frame it estimates homogeneous fluid; then the filter starts from t = 0
-    and assimilates the frame. After the last measurement the lag shrinks.
+    During the calibration frame it returns the homogeneous estimate; then the filter starts from
+    t = 0 and assimilates the frame. After the last measurement the lag shrinks.
 
     Parameters
     ----------
@@ -106,12 +106,12 @@ class FilterEstimator:
 
 
 class SmootherEstimator:
-    """Smoother of a whole record as an estimator: it is silent until the last measurement.
+    """Estimator that smooths a complete measurement sequence, and returns None until its end.
 
     Parameters
     ----------
     task : Task
-        Its lag is that of the smoothing board.
+        Task of the smoothing subtrack.
     smooth : callable
         ĉ_bh in mol/m³ and the measurements t = 1 … T -> the estimates of their states.
     """
@@ -124,7 +124,7 @@ class SmootherEstimator:
         self._requested = 0
 
     def update(self, voltages: np.ndarray, currents: np.ndarray) -> Estimate | None:
-        """Return the states one by one, once the record, (L,) V and A at a time, is complete."""
+        """Return the states one by one, after the last measurement vector, (L,) V and A each."""
         if len(self._record) < self.task.n_steps:
             self._record.append((voltages, currents))
             if len(self._record) < self.task.n_steps:

@@ -1,4 +1,4 @@
-"""Kalman filters: one recursion for every state space (thesis 5.1, docs/methods.md, 5)."""
+"""Kalman filters: one recursion for all state spaces (thesis 5.1, docs/methods.md, 5)."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from eitbench.worlds.task import Estimate
 
 
 class StateSpace:
-    """State x of a filter: its motion, and the concentration that follows from it.
+    """State x of a filter: its evolution, and the concentration as a function of it.
 
-    Subclasses define how the mean and covariance move and the concentration; the other methods have
-    defaults for a state that is the concentration itself.
+    Subclasses define the propagation of mean and covariance, and the concentration; the other
+    methods have defaults for a state that is the concentration itself.
     """
 
     def initial(self) -> tuple[np.ndarray, Covariance]:
@@ -53,17 +53,17 @@ class StateSpace:
 
 
 class Step(NamedTuple):
-    """Result of one filter step, and what the backward pass of a smoother needs."""
+    """Quantities of one filter step, also for the backward pass of a smoother."""
 
     time: int
     predicted_mean: np.ndarray
     """(n,) x_{t|t−1}"""
     predicted_covariance: Covariance
-    """P_{t|t−1}; in the dense form the filter's own, which has changed since"""
+    """P_{t|t−1}; in the dense form the filter's object, which later steps overwrite"""
     mean: np.ndarray
     """(n,) x_{t|t}"""
     matrix: np.ndarray
-    """(m, k) H, derivatives of the readings by the first k entries of x"""
+    """(m, k) H, derivatives of the measurements by the first k entries of x"""
     innovation: np.ndarray
     """(m,) ν"""
     innovation_covariance: np.ndarray
@@ -71,7 +71,7 @@ class Step(NamedTuple):
     cross_covariance: np.ndarray
     """(n, m) P_{t|t−1} Hᵀ"""
     accepted: np.ndarray
-    """(m,) bool: readings that passed the gate; the fields above are of all readings"""
+    """(m,) bool: measurements that passed the gate; the fields above include all measurements"""
     variance: np.ndarray | None = None
     """(n,) diagonal of P_{t|t}; only `kalman_filter` sets it"""
 
@@ -81,7 +81,7 @@ LinearisedMeasurement = tuple[LinearMeasurement, np.ndarray, np.ndarray]
 
 
 class Filter:
-    """Kalman filter on a state space, extended where concentration or voltages are nonlinear.
+    """Kalman filter on a state space; extended (EKF) where concentration or voltages are nonlinear.
 
     Parameters
     ----------
@@ -89,14 +89,14 @@ class Filter:
     forward : callable, optional
         Linearises voltages about a concentration; for `assimilate`.
     gate : float
-        Readings further than this many standard deviations from the prediction are rejected.
+        Innovation gate: larger deviations, in predicted standard deviations, are rejected.
     iterated : bool
-        `assimilate` linearises each measurement once more, about the first estimate.
+        `assimilate` linearises each measurement vector a second time, about the first estimate.
 
     Attributes
     ----------
     mean, covariance
-        Of the present state.
+        Mean and covariance of the present state.
     """
 
     def __init__(self, space: StateSpace, forward: Forward | None = None, *,
@@ -173,7 +173,7 @@ class Filter:
 
 
 def kalman_filter(start: Filter, observations: Iterable[LinearMeasurement]) -> list[Step]:
-    """Run ``start`` over a record: predict, then update, for each observation."""
+    """Run ``start`` over a measurement sequence: predict, then update, at each time step."""
     steps = []
     for observation in observations:
         start.predict()

@@ -1,4 +1,4 @@
-"""Linearised voltages: what a filter conditions on (thesis 5.2)."""
+"""Linearised voltages, the measurements of a filter (thesis 5.2)."""
 
 from __future__ import annotations
 
@@ -18,11 +18,9 @@ Forward = Callable[[np.ndarray, np.ndarray, np.ndarray], LinearMeasurement]
 
 
 def linearise_voltages(model: VoltageModel, noise: VoltageNoise, point: np.ndarray,
-               voltages: np.ndarray, currents: np.ndarray) -> LinearMeasurement:
-    """Linearise V_t − R_t(c*) + J_t c* = J_t c + v about ``point`` (n,), for an injection (L,).
-
-    The noise is that of the voltages computed at the point.
-    """
+                       voltages: np.ndarray, currents: np.ndarray) -> LinearMeasurement:
+    """Linearise V_t − R_t(c*) + J_t c* = J_t c + v about c* = ``point`` (n,), for an injection
+    (L,). The noise level follows from the voltages computed at the point."""
     computed, jacobian = (array[0] for array in model.linearise(point, currents[None]))
     return LinearMeasurement(jacobian, voltages - computed + jacobian @ point,
                              noise.std(computed)**2)
@@ -56,7 +54,7 @@ def linearise_at_reference(task: Task, c_ref: float) -> Forward:
 
 
 def linearise_at_prediction(task: Task) -> Forward:
-    """Return the linearisation of the task's voltages about each prediction (extended Kalman
-    filter)."""
+    """Return the linearisation of the task's voltages about each prediction, as in an extended
+    Kalman filter."""
     return lambda point, voltages, currents: linearise_voltages(task.observation, task.noise, point,
                                                                 voltages, currents)

@@ -1,4 +1,4 @@
-"""Stationary reconstruction: a frame of injections, as if the target stood still (thesis 5.11)."""
+"""Stationary reconstruction from one frame, for a target at a fixed position (thesis 5.11)."""
 
 from __future__ import annotations
 
@@ -19,22 +19,22 @@ if TYPE_CHECKING:
 def gauss_newton(model: VoltageModel, voltages: np.ndarray, currents: np.ndarray,
                  noise_std: np.ndarray, penalty: Any, start: np.ndarray, *,
                  tolerance: float = 1e-3, max_iterations: int = 20) -> np.ndarray:
-    """argmin_c ‖(V − R(c))/std‖² + cᵀ penalty c, by Gauss–Newton with step halving.
+    """Return argmin_c ‖(V − R(c))/std‖² + cᵀ penalty c, by Gauss–Newton with step halving.
 
-    (n,) in mol/m³; the best so far if ``max_iterations`` run out or no step lowers the objective.
+    (n,) in mol/m³; the best iterate if ``max_iterations`` run out or no step lowers the objective.
 
     Parameters
     ----------
     model : VoltageModel
     voltages, currents, noise_std : (K, L)
-        One frame: measurements in V, NaN where one is missing, injections in A (A/m in 2D),
-        standard deviations in V.
+        One frame: measurements in V, NaN where missing, injections in A (A/m in 2D), standard
+        deviations in V.
     penalty : (n, n) sparse or dense
         α² L_cᵀL_c; for the smoothness prior α² times the stiffness matrix, ∫|∇c|².
     start : (n,)
-        First guess in mol/m³.
+        Initial guess in mol/m³.
     tolerance : float
-        Stop when a full step would lower the objective by less than this part of it.
+        Stop when a full step would lower the objective by a smaller relative amount.
     """
     normal = _NormalEquations(penalty)
     missing = np.isnan(voltages)
@@ -72,23 +72,23 @@ def gauss_newton(model: VoltageModel, voltages: np.ndarray, currents: np.ndarray
 
 
 class _NormalEquations:
-    """(AᵀA + P) x = g for one P (n, n), positive semidefinite, and any A (m, n).
+    """Solver of (AᵀA + P) x = g for one P (n, n), positive semidefinite, and any A (m, n).
 
-    Where P is sparse and A has far fewer rows than columns, x = P₀⁻¹g − W (C + V W)⁻¹ Wᵀg with
+    For sparse P and A with far fewer rows than columns, x = P₀⁻¹g − W (C + V W)⁻¹ Wᵀg with
     P₀ = P + ρ e eᵀ, V = (A; √ρ eᵀ), C = diag(1, …, 1, −1) and W = P₀⁻¹Vᵀ (Woodbury). The unit
-    vector e is there for penalties of gradients, which leave a constant free. If P leaves more
-    free, P₀ is singular, or a residual stays; then, and for others, AᵀA + P is factorised whole.
+    vector e makes P₀ regular for gradient penalties, whose null space holds the constants. If P₀
+    is singular or the residual is too large, and in all other cases, AᵀA + P is factorised.
     """
 
     def __init__(self, penalty: Any) -> None:
         self._penalty = penalty
 
     def solve(self, A: np.ndarray, g: np.ndarray) -> np.ndarray:
-        """x (n,) for g (n,)."""
+        """Return x (n,) for g (n,)."""
         if sp.issparse(self._penalty) and 3 * len(A) < len(g) and self._grounded is not None:
             apply = self._by_woodbury(A, self._grounded)
             x = apply(g)
-            x += apply(self._residual(A, g, x))                     # what cancelled in the first
+            x += apply(self._residual(A, g, x))              # refinement, because of cancellation
             if np.linalg.norm(self._residual(A, g, x)) <= 1e-10 * np.linalg.norm(g):
                 return x
         return cho_solve(cho_factor(A.T @ A + self._dense), g)
@@ -115,7 +115,7 @@ class _NormalEquations:
 
     @cached_property
     def _grounded(self) -> SparseLU | None:
-        """P₀, held at the first node; None if it is singular."""
+        """P₀, with e at the first node; None if it is singular."""
         held = sp.csr_array(([self._ground], ([0], [0])), shape=self._penalty.shape)
         try:
             return SparseLU(self._penalty + held)

@@ -1,4 +1,4 @@
-"""Innovate, gate and condition: the recursion behind every filter (docs/methods.md, 5)."""
+"""Innovation, gate and conditioning: the update of every filter (docs/methods.md, 5)."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ class LinearMeasurement(NamedTuple):
     value: np.ndarray
     """(m,)"""
     noise_variance: np.ndarray
-    """(m,) of v"""
+    """(m,) variance of v"""
     noise_root: np.ndarray | None = None
-    """(m, s) N, of errors that readings have in common; None: there are none"""
+    """(m, s) N of errors that the measurements share; None: no shared errors"""
 
 
 class Innovation(NamedTuple):
-    """Measured minus predicted readings, and their predicted covariance."""
+    """Measured minus predicted values, and their predicted covariance."""
 
     value: np.ndarray
     """(m,) ν"""
@@ -37,8 +37,8 @@ class Innovation(NamedTuple):
 
 def innovate(covariance: Covariance, matrix: np.ndarray, residual: np.ndarray,
              noise_variance: np.ndarray, noise_root: np.ndarray | None = None) -> Innovation:
-    """Return the innovation of readings whose derivatives by the first k entries of the state are
-    ``matrix`` (m, k), and which are ``residual`` (m,) above the prediction."""
+    """Return the innovation of measurements that exceed the prediction by ``residual`` (m,), with
+    derivatives ``matrix`` (m, k) by the first k entries of the state."""
     cross = covariance.times(matrix.T)
     S = matrix @ cross[:matrix.shape[1]]
     if noise_root is not None:
@@ -47,10 +47,10 @@ def innovate(covariance: Covariance, matrix: np.ndarray, residual: np.ndarray,
 
 
 def gate_mask(innovation: np.ndarray, variance: np.ndarray, gate: float) -> np.ndarray:
-    """Accept readings within ``gate`` predicted standard deviations of the prediction.
+    """Accept measurements within ``gate`` predicted standard deviations of the prediction.
 
-    Missing readings, NaN, are rejected. Where more than a third of the others lie beyond, the
-    injection itself has failed, and none is accepted.
+    Missing measurements (NaN) are rejected. If more than a third of the others exceed the gate, the
+    injection itself has failed, and all are rejected.
 
     Parameters
     ----------
@@ -67,8 +67,8 @@ def gate_mask(innovation: np.ndarray, variance: np.ndarray, gate: float) -> np.n
 
 def condition(mean: np.ndarray, covariance: Covariance, innovation: Innovation,
               gate: float = math.inf) -> tuple[np.ndarray, Covariance, np.ndarray]:
-    """Return mean (n,) and covariance given the readings that pass the ``gate``, and which did
-    (m,)."""
+    """Return mean (n,) and covariance given the measurements that pass the ``gate``, and the mask
+    (m,) of these."""
     value, S, cross = innovation
     accepted = gate_mask(value, S.diagonal(), gate)
     if not accepted.all():

@@ -1,4 +1,4 @@
-"""Best homogeneous estimate: the one concentration that fits the voltages best."""
+"""Best homogeneous estimate: the constant concentration that fits the voltages best."""
 
 from __future__ import annotations
 
@@ -13,23 +13,23 @@ if TYPE_CHECKING:
 def best_homogeneous(model: VoltageModel, noise: VoltageNoise, n: int, voltages: np.ndarray,
                      currents: np.ndarray, start: float, *, tolerance: float = 1e-8,
                      max_iterations: int = 30) -> float:
-    """ĉ_bh = argmin_c Σ ((V − R(c·1))/std)², by Gauss–Newton in ln c (``docs/methods.md``, 3).
+    """Return ĉ_bh = argmin_c Σ ((V − R(c·1))/std)², by Gauss–Newton in ln c (docs/methods.md, 3).
 
-    Steps in ln c keep it positive. ``RuntimeError`` if the iteration does not settle.
+    Steps in ln c keep c positive. ``RuntimeError`` if the iteration does not converge.
 
     Parameters
     ----------
     model : VoltageModel
     noise
-        Has ``std(voltages)``; the weights are those of the measured voltages.
+        Noise model with a method ``std(voltages)``, evaluated at the measured voltages.
     n : int
         Number of nodes.
     voltages, currents : (K, L)
-        Measurements in V, NaN where one is missing, and injections in A (A/m in 2D).
+        Measurements in V, NaN where missing, and injections in A (A/m in 2D).
     start : float
-        First guess in mol/m³, > 0.
+        Initial guess in mol/m³, > 0.
     """
-    # Injections repeat: R(c·1) is needed once for each distinct pattern.
+    # Injections repeat: R(c·1) is computed once for each distinct pattern.
     patterns, which = np.unique(currents, axis=0, return_inverse=True)
     which = which.reshape(-1)
     weight = np.isfinite(voltages) / noise.std(np.nan_to_num(voltages))
@@ -43,5 +43,5 @@ def best_homogeneous(model: VoltageModel, noise: VoltageNoise, n: int, voltages:
         c *= float(np.exp(change))
         if abs(change) < tolerance:
             return c
-    raise RuntimeError(f"best homogeneous estimate did not settle in {max_iterations} iterations; "
-                       f"last change {change:g}, last value {c:g} mol/m³")
+    raise RuntimeError(f"best homogeneous estimate did not converge in {max_iterations} "
+                       f"iterations; last change {change:g}, last value {c:g} mol/m³")

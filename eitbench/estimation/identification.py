@@ -1,4 +1,4 @@
-"""Learning a pipe's model from training episodes (``docs/methods.md``, 12)."""
+"""Identification of a pipe's model from training episodes (``docs/methods.md``, 12)."""
 
 from __future__ import annotations
 
@@ -19,21 +19,21 @@ from eitbench.worlds.task import Task, make_task
 from eitbench.worlds.world import World
 
 INLET_VARIANCE_CUTOFF = 1e-4
-"""Modes across the inlet of less than this part of the inflow's variance are left out."""
+"""Modes across the inlet with a smaller fraction of the inflow's variance are dropped."""
 DEFAULT_RIDGE = 1e-6
-"""of the mean square of what an inflow is known by: keeps apart what never came apart."""
+"""Ridge parameter, relative to the mean square of the regressors."""
 CV_RIDGES = 10.0**np.arange(-6, 3)
-"""The same, of which cross-validation chooses where the flow as told is corrected."""
+"""Ridge parameters among which cross-validation chooses with ``residual_only``."""
 CV_FOLDS = 4
-"""of the episodes, each left out in turn"""
+"""Number of cross-validation folds of the episodes."""
 VOLTAGE_STRIDE = 3
-"""Voltages are compared at each third step only: neighbours say much the same, and three turns pass
-all injections of a cycle that is no multiple of it."""
+"""Voltages are compared at every third step only: errors of neighbouring steps are similar, and all
+injections are covered unless the cycle length is a multiple of it."""
 
 
 class RegressionSums(NamedTuple):
-    """Sums over states of training episodes, s being past inflows and d = c/c_0 − 1, of which l is
-    what the flow that is told does not explain, or all."""
+    """Sums over states of training episodes, with past inflows s, d = c/c_0 − 1, and l the residual
+    of d from the task's flow, or d itself."""
 
     states: int
     inflow: np.ndarray
@@ -45,35 +45,35 @@ class RegressionSums(NamedTuple):
     state: np.ndarray
     """(n, n) Σ d dᵀ"""
     off: np.ndarray
-    """(P, L) Σ of errors of readings, in standard deviations of their noise"""
+    """(P, L) Σ of voltage errors, in standard deviations of the noise"""
     scatter: np.ndarray
     """(P, L, L) Σ of their products"""
     compared: np.ndarray
-    """(P,) of so many readings"""
+    """(P,) number of measurement vectors in these sums"""
 
 
 def identify_model(examples: Dataset, *, modes: int = 64, residual_only: bool = False,
-                     linearised: bool = False, progress: Any = iter,
-                     source: Mapping[str, Any] | None = None) -> IdentifiedModel:
-    """What an inflow leaves in the pipe, by ridge regression of the true states on the inflows
-    before them; and by how much that, and the voltages that the task's model computes, are off.
+                   linearised: bool = False, progress: Any = iter,
+                   source: Mapping[str, Any] | None = None) -> IdentifiedModel:
+    """Identify impulse response and voltage errors by ridge regression of states on past inflows.
 
-    A state's deviation is linear in the inflows of the past, whatever the flow is, as long as it is
-    always the same. The concentration is told in the strongest modes of the training states.
+    In a steady flow, a state's deviation is linear in the past inflows. The concentration is
+    represented in the leading modes of the training states. The model includes the covariance of
+    the residuals and the errors of the voltages that the task's model computes.
 
     Parameters
     ----------
     examples : Dataset
-        Episodes of the split train.
+        Episodes of the train split.
     modes : int
         q.
     residual_only : bool
-        Take what the flow as told leaves for granted, and regress only what that is off, with the
-        ridge that predicts episodes best which it has not seen: where the flow is known and only
-        its mesh is coarse, or episodes are few.
+        Keep the impulse response of the task's flow and regress only its residual, with the ridge
+        parameter of the best cross-validated prediction: for a known flow on a coarse mesh, or for
+        few episodes.
     linearised : bool
-        Compare readings with voltages that are linearised once, about ĉ_bh, and learn how they
-        scatter about these (`IdentifiedModel.scatter`).
+        Compare measurements with voltages linearised once, about ĉ_bh, and estimate the covariance
+        of the differences (`IdentifiedModel.voltage_error_covariance`).
     progress : callable
         Wraps the iteration over the examples; such as ``tqdm``.
     source
@@ -82,11 +82,11 @@ def identify_model(examples: Dataset, *, modes: int = 64, residual_only: bool = 
     Raises
     ------
     ValueError
-        If an episode is of another split, the world has no inflow, there are more modes than
-        states to learn from, or too few episodes to leave some out.
+        If an episode is of another split, the world has no inflow, there are not more states than
+        modes, or there are fewer episodes than folds.
     """
     if others := [seed for seed in examples.seeds if seed not in SPLITS["train"]]:
-        raise ValueError("examples' seeds must be of the split train, from which alone is learned; "
+        raise ValueError("examples' seeds must be of the split train, the only one for fitting; "
                          f"got {format_seed(others[0])}")
     world = examples.world
     q = _check.integer("modes", modes, low=1, high=examples.mesh.n_nodes)
@@ -133,7 +133,7 @@ def _together(parts: list[RegressionSums]) -> RegressionSums:
 
 def _regressed(moments: RegressionSums, to_modes: np.ndarray,
                ridge: float) -> tuple[np.ndarray, np.ndarray, float]:
-    """What is left (K·r, q) for each inflow, Σ s lᵀ in modes, and how many states are free."""
+    """Return the weights (K·r, q), Σ s lᵀ in modes, and the residual degrees of freedom."""
     cross = moments.cross @ to_modes
     ridged = moments.inflow + ridge * _mean_square(moments) * np.eye(len(cross))
     solved = np.linalg.solve(ridged, np.concatenate([cross, moments.inflow], axis=1))
@@ -146,7 +146,7 @@ def _mean_square(moments: RegressionSums) -> float:
 
 
 def _ridge(parts: list[RegressionSums], to_modes: np.ndarray) -> float:
-    """The one that predicts each part best from the others; of one part `DEFAULT_RIDGE`."""
+    """Return the ridge parameter of the best cross-validation; `DEFAULT_RIDGE` for one part."""
     if len(parts) == 1:
         return DEFAULT_RIDGE
     losses = np.zeros(len(CV_RIDGES))
@@ -158,13 +158,13 @@ def _ridge(parts: list[RegressionSums], to_modes: np.ndarray) -> float:
         inflow = directions.T @ part.inflow @ directions
         for k, ridge in enumerate(CV_RIDGES):
             weights = theirs / (values + ridge * _mean_square(others))[:, None]
-            # the squared error of the part, but for what does not depend on the weights
+            # squared error of the part, up to a constant
             losses[k] += (weights * (inflow @ weights)).sum() - 2.0 * (ours * weights).sum()
     return float(CV_RIDGES[losses.argmin()])
 
 
 def _across(world: World, seeds: Iterable[int]) -> np.ndarray:
-    """(n_inlet, r) orthonormal: the strongest modes of the inflow across the inlet."""
+    """Return the leading orthonormal modes (n_inlet, r) of the inflow across the inlet."""
     s = np.concatenate([world.sample_inflow(seed) for seed in seeds]) / world.background - 1.0
     values, vectors = np.linalg.eigh(s.T @ s)
     return vectors[:, values > INLET_VARIANCE_CUTOFF * values.sum()][:, ::-1]
@@ -172,7 +172,7 @@ def _across(world: World, seeds: Iterable[int]) -> np.ndarray:
 
 def _moments(examples: Iterable[Example], world: World, task: Task, across: np.ndarray,
              known: np.ndarray, linearised: bool) -> RegressionSums:
-    """Where past inflows are known (n, K·r) to leave something."""
+    """Return the sums over examples, minus the response ``known`` (n, K·r) to past inflows."""
     n, size = known.shape
     count = 0
     inflow, cross = np.zeros((size, size)), np.zeros((size, n))
@@ -182,7 +182,7 @@ def _moments(examples: Iterable[Example], world: World, task: Task, across: np.n
     compared = np.zeros(P)
     for example in examples:
         s = inflow_regressors(world.sample_inflow(example.seed) / world.background - 1.0, across,
-                           len(example.truth), size // across.shape[1])
+                              len(example.truth), size // across.shape[1])
         d = example.truth / world.background - 1.0
         l = d - s @ known.T
         inflow += s.T @ s
@@ -198,8 +198,8 @@ def _moments(examples: Iterable[Example], world: World, task: Task, across: np.n
 
 
 def _errors(task: Task, example: Example, linearised: bool) -> Iterator[tuple[int, np.ndarray]]:
-    """By how much readings (L,) exceed what is computed from the true states t + 1, in standard
-    deviations of their noise."""
+    """Yield t and measured minus computed voltages (L,) at the true states t + 1, in standard
+    deviations of the noise."""
     truth = example.truth.astype(float)
     if linearised:
         first = CalibrationFrame(task)
@@ -216,8 +216,8 @@ def _errors(task: Task, example: Example, linearised: bool) -> Iterator[tuple[in
 
 
 def inflow_regressors(s: np.ndarray, across: np.ndarray, steps: int, memory: int) -> np.ndarray:
-    """(T, K·r) of each of the last T states: its K last inflows, in modes; nothing deviates before
-    the record of inflows (·, n_inlet) begins."""
+    """Return the K last inflows in modes, (T, K·r), for each of the last T states; deviations
+    before the first inflow of ``s`` (·, n_inlet) are zero."""
     reduced = s @ across
     longer = np.concatenate([np.zeros((memory, reduced.shape[1])), reduced])
     newest = len(longer) - steps + np.arange(steps)

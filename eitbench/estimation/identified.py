@@ -1,5 +1,5 @@
-"""A pipe's model as training episodes show it: what an inflow leaves, and by how much that and the
-voltages are off (``docs/methods.md``, 12)."""
+"""Model of a pipe identified from training episodes: impulse response, and errors of states and
+voltages (``docs/methods.md``, 12)."""
 
 from __future__ import annotations
 
@@ -29,43 +29,43 @@ FILE_KEYS = {"basis": "basis", "impulse_response": "weights", "inlet_modes": "ac
              "voltage_error_covariance": "scatter"}
 """Field of `IdentifiedModel` -> its key in files; the last may be missing."""
 FINGERPRINT_ATOL = 1e-4
-"""Tasks whose `told` differ by less are the same."""
+"""Absolute tolerance for comparing the fingerprints of two tasks."""
 PROBE_WIDTH_M = 0.02
-"""m: standard deviation of the blob that `told` lets the flow carry."""
+"""Standard deviation in m of the blob that `task_fingerprint` advects."""
 
 
 @dataclass(frozen=True, eq=False)
 class IdentifiedModel:
-    """c_t = ĉ_bh (1 + B (Σ_k W_k s_{t−k} + e_t)), s = c_in/ĉ_bh − 1, and V = R(c) + std·b + v.
+    """Model c_t = ĉ_bh (1 + B (Σ_k W_k s_{t−k} + e_t)), s = c_in/ĉ_bh − 1, V = R(c) + std·b + v.
 
-    e_t ~ N(0, Γ_e) is taken for white. Where a model is wrong in the same way each time, its mean
-    error b, and the response W that takes in what is wrong with the flow, correct it; Γ_e says how
-    much is left (Kaipio & Somersalo 2007). With a `scatter`, R is linearised once, about ĉ_bh, and
-    v is what is off then, noise and all. ``ValueError`` naming what is of the wrong shape.
+    e_t ~ N(0, Γ_e) is modelled as white. The mean voltage error b and the identified response W
+    absorb systematic model error; Γ_e is the covariance of the remainder (Kaipio & Somersalo 2007).
+    With a `voltage_error_covariance`, R is linearised once, about ĉ_bh, and v includes noise and
+    linearisation error. ``ValueError`` naming a field of the wrong shape.
     """
 
     basis: np.ndarray
     """(n, q) B, orthonormal in M̃"""
     impulse_response: np.ndarray
-    """(q, K, r) of the inflow k = 0 … K − 1 steps ago, in modes across the inlet: W_k = weights_k
-    acrossᵀ"""
+    """(q, K, r) for the inflow k = 0 … K − 1 steps ago, in modes across the inlet: W_k =
+    impulse_response_k inlet_modesᵀ"""
     inlet_modes: np.ndarray
     """(n_inlet, r)"""
     residual_covariance: np.ndarray
     """(q, q) Γ_e"""
     current_patterns: np.ndarray
-    """(P, L) A (A/m in 2D): injections that were seen"""
+    """(P, L) A (A/m in 2D): injections of the training episodes"""
     mean_voltage_error: np.ndarray
-    """(P, L) b of each, in standard deviations of the reading's noise"""
+    """(P, L) b of each, in standard deviations of the noise"""
     task_fingerprint: np.ndarray
-    """(J,) of the task, by `told`"""
+    """(J,) result of `task_fingerprint` for the task"""
     c_ref: float
-    """mol/m³ with which the pipe was filled"""
+    """mol/m³, the initial concentration in the pipe"""
     source: Mapping[str, Any] = field(default_factory=dict)
-    """where it comes from, fit for JSON"""
+    """Provenance, serialisable as JSON"""
     voltage_error_covariance: np.ndarray | None = None
-    """(P, L, L) covariance of v where R is linearised once, in products of noise standard
-    deviations; None: R is not, and v is the noise"""
+    """(P, L, L) covariance of v if R is linearised once, relative to products of noise standard
+    deviations; None: R is nonlinear, and v is the noise"""
 
     def __post_init__(self) -> None:
         q = _check.array("basis", self.basis, (None, None)).shape[1]
@@ -81,7 +81,7 @@ class IdentifiedModel:
 
     @property
     def response(self) -> ImpulseResponse:
-        """B and W."""
+        """Impulse response: B and W."""
         return ImpulseResponse(self.basis, self.impulse_response @ self.inlet_modes.T)
 
     @cached_property
@@ -92,14 +92,14 @@ class IdentifiedModel:
         return root
 
     def mean_error(self, currents: np.ndarray, std: np.ndarray) -> np.ndarray:
-        """(L,) V by which readings of an injection (L,) exceed R(c), with ``std`` (L,) V of their
-        noise; zero if that injection never was seen."""
+        """Return the mean of V − R(c) (L,) in V for an injection (L,), with noise ``std`` (L,) in
+        V; zero if the training episodes do not contain the injection."""
         number = self._number(currents)
         return np.zeros_like(std) if number is None else self.mean_voltage_error[number] * std
 
     def error_root(self, currents: np.ndarray, std: np.ndarray) -> np.ndarray:
-        """(L, L) V: N with N Nᵀ the covariance of v for an injection (L,), with ``std`` (L,) V of
-        the noise alone; that of the noise if the injection never was seen, or without `scatter`."""
+        """Return N (L, L) in V, with N Nᵀ the covariance of v for an injection (L,) and noise
+        ``std`` (L,) in V; the noise alone if the injection has no `voltage_error_covariance`."""
         number = self._number(currents)
         if self.voltage_error_covariance is None or number is None:
             return np.diag(std)
@@ -107,13 +107,13 @@ class IdentifiedModel:
         return root
 
     def _number(self, currents: np.ndarray) -> int | None:
-        """Of the injection among the `patterns`."""
+        """Return the index of the injection in `current_patterns`."""
         seen = np.flatnonzero(np.isclose(self.current_patterns, currents).all(axis=1))
         return int(seen[0]) if len(seen) else None
 
     def forward(self, task: Task, c_ref: float) -> Forward:
-        """Return the task's voltages with the model's errors, about each prediction, or linearised
-        once about ``c_ref`` in mol/m³ where there is a `scatter`."""
+        """Return the linearised voltages with the model's errors: about each prediction, or once
+        about ``c_ref`` in mol/m³ with a `voltage_error_covariance`."""
         linearise = (linearise_at_prediction(task) if self.voltage_error_covariance is None
                      else linearise_at_reference(task, c_ref))
 
@@ -130,7 +130,7 @@ class IdentifiedModel:
         return measure
 
     def matches_task(self, task: Task) -> bool:
-        """Whether it was made for a task with this mesh, these injections and this told flow."""
+        """Return whether the model is for this mesh, these injections and this flow model."""
         n_electrodes = self.mean_voltage_error.shape[1]
         if task.mesh.n_nodes != len(self.basis) or task.currents.shape[1] != n_electrodes:
             return False
@@ -149,7 +149,7 @@ class IdentifiedModel:
 
     @classmethod
     def load(cls, path: Path) -> IdentifiedModel:
-        """What `save` has written; ``ValueError`` naming the file if it is nothing of the kind."""
+        """Load a file that `save` wrote; ``ValueError`` naming the file if it is not valid."""
         try:
             with np.load(path, allow_pickle=False) as file:
                 arrays = {name: file[key].astype(float) for name, key in FILE_KEYS.items()
@@ -161,8 +161,8 @@ class IdentifiedModel:
 
 
 def task_fingerprint(task: Task) -> np.ndarray:
-    """What a task tells of vessel, injections and flow: voltages of a homogeneous vessel in parts
-    of the largest, and where (m) one time step carries a blob in its middle."""
+    """Return a fingerprint of a task's vessel, injections and flow: homogeneous voltages relative
+    to the largest, and the position (m) of a blob from the middle after one time step."""
     c_ref = task.expected_concentration
     x = task.mesh.points
     blob = np.exp(-0.5 * ((x - x.mean(axis=0))**2).sum(axis=1) / PROBE_WIDTH_M**2)
@@ -173,8 +173,8 @@ def task_fingerprint(task: Task) -> np.ndarray:
 
 
 def compatible_models(folder: Path, task: Task) -> list[IdentifiedModel]:
-    """Those in a folder's files that are of this task: first those that were learned in the task's
-    own world, then the others, by name."""
+    """Return the models in a folder's files for this task: first the models identified in the
+    task's world, then the others, by file name."""
     models = map(_loaded, sorted(folder.glob("*.npz")))
     suiting = [model for model in models if model.matches_task(task)]
     return sorted(suiting, key=lambda model: source_world(model.source) not in

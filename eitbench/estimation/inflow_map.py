@@ -1,4 +1,4 @@
-"""Most probable history of the inflow, by Gauss–Newton (docs/methods.md, 10)."""
+"""Maximum a posteriori (MAP) estimate of all inflows, by Gauss–Newton (docs/methods.md, 10)."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ from eitbench.estimation.inflow_window import InflowWindow, inflow_filter
 from eitbench.worlds.task import Estimate, Task
 
 STEP_TOLERANCE = 1e-3
-"""Largest change of an inflow, in prior standard deviations, of the last iteration."""
+"""Stop if no inflow changes by more in an iteration, in prior standard deviations."""
 MAX_ITERATIONS = 12
-"""Iterations."""
+"""Maximum number of Gauss–Newton iterations."""
 
 
 def full_window_filter(task: Task, prior: InflowPrior, c_ref: float, record: Sequence[Measurement],
-                    responses: Sequence[ImpulseResponse] | None = None,
-                    model: IdentifiedModel | None = None) -> Filter:
-    """Return the filter at the end of a record, whose window holds the whole record: its
-    `Filter.estimate` returns all states, with everything measured known."""
+                       responses: Sequence[ImpulseResponse] | None = None,
+                       model: IdentifiedModel | None = None) -> Filter:
+    """Return the filter at the end of a measurement sequence, with a window over all of it: its
+    `Filter.estimate` returns all states, conditioned on all measurements."""
     smoother = inflow_filter(task, prior, c_ref, len(record), responses=responses, model=model)
     for measurement in record:
         smoother.assimilate(*measurement)
@@ -36,7 +36,7 @@ def full_window_filter(task: Task, prior: InflowPrior, c_ref: float, record: Seq
 def map_inflow(task: Task, prior: InflowPrior, c_ref: float, record: Sequence[Measurement],
                responses: Sequence[ImpulseResponse] | None = None,
                model: IdentifiedModel | None = None) -> list[Estimate]:
-    """Return the states t = 1 … T of a record that the `maximise_posterior` makes."""
+    """Return the states t = 1 … T of a measurement sequence from `maximise_posterior`."""
     smoother = full_window_filter(task, prior, c_ref, record, responses, model)
     maximise_posterior(smoother, task, record, model)
     return [smoother.estimate(lag)._replace(innovation=None, innovation_covariance=None)
@@ -44,17 +44,17 @@ def map_inflow(task: Task, prior: InflowPrior, c_ref: float, record: Sequence[Me
 
 
 def maximise_posterior(smoother: Filter, task: Task, record: Sequence[Measurement],
-                         model: IdentifiedModel | None = None) -> None:
-    """Move what `full_window_filter` has found to the maximum of the posterior density, with the
-    covariance there, linearised at all states anew.
+                       model: IdentifiedModel | None = None) -> None:
+    """Move the mean of `full_window_filter` to the maximum of the posterior density, and set the
+    covariance to the Laplace approximation there.
 
     With x = L z, z ~ N(0, I), it minimises ‖z‖² + Σ_t ‖A_t (V_t − R(c_t(x)))‖² by Gauss–Newton with
-    step halving. A_t whitens the voltage errors; the noise is that of the voltages computed from
-    the smoothed states. ``ValueError`` if voltages are linearised once in the model.
+    step halving. A_t whitens the voltage errors; the noise level follows from the voltages at the
+    smoothed states. ``ValueError`` if the model linearises voltages only once.
     """
     if model is not None and model.voltage_error_covariance is not None:
-        raise ValueError("model must have voltages that are linearised anew, got one whose "
-                         "voltages are linearised once")
+        raise ValueError("model must have voltages that are linearised at each estimate, got one "
+                         "whose voltages are linearised once")
     posterior = _Posterior(smoother, task, record, model)
     z = solve_triangular(posterior.root, smoother.mean.reshape(len(posterior.root), -1), lower=True)
     value = posterior.value(z)
@@ -65,7 +65,7 @@ def maximise_posterior(smoother: Filter, task: Task, record: Sequence[Measuremen
         length = 1.0
         while (after := posterior.value(z + length * change)) > value and length > 1e-3:
             length *= 0.5
-        if after > value:                                            # only rounding is left
+        if after > value:                                            # converged up to rounding
             break
         z = z + length * change
         value = after
@@ -80,7 +80,7 @@ def maximise_posterior(smoother: Filter, task: Task, record: Sequence[Measuremen
 
 
 class _Posterior:
-    """−2 ln of the posterior density of a record of T measurements, as a function of z (W, r)."""
+    """−2 ln of the posterior density given T measurement vectors, as a function of z (W, r)."""
 
     def __init__(self, smoother: Filter, task: Task, record: Sequence[Measurement],
                  model: IdentifiedModel | None) -> None:
@@ -99,7 +99,7 @@ class _Posterior:
         """(T, L, L) A_t"""
 
     def value(self, z: np.ndarray) -> float:
-        """Return the function to be minimised."""
+        """Return the value of the function."""
         mean = (self.root @ z).ravel()
         voltages, at = self.observation.voltages, self.space.concentration
         computed = [voltages(at(mean, lag), currents[None])[0] for lag, currents in self.by_lag]

@@ -1,5 +1,5 @@
-"""What is believed of the inflow: a Gaussian process in time and across the inlet, or its
-exponential (``docs/methods.md``, 10)."""
+"""Priors of the inflow: a Gaussian process in time and across the inlet, or its exponential
+(``docs/methods.md``, 10)."""
 
 from __future__ import annotations
 
@@ -25,24 +25,24 @@ if TYPE_CHECKING:
 REGIME_KEYS = {"p_onset": "begins", "p_end": "ends", "quiet_variance_ratio": "quiet"}
 """Field of `Regimes` -> its key in files of priors."""
 LINK_NAMES = ("linear", "logarithm")
-"""What is Gaussian: c_in/ĉ_bh − 1, or ln(c_in/ĉ_bh)."""
+"""Gaussian quantity: c_in/ĉ_bh − 1, or ln(c_in/ĉ_bh)."""
 NODE_ATOL_M = 1e-6
-"""m between nodes that are taken for the same: an obstacle downstream moves them a little."""
+"""Tolerance in m for equal nodes: an obstacle downstream moves the inlet's nodes slightly."""
 MIN_STEPS = 16
-"""Steps that an inflow must have to learn a correlation from."""
+"""Minimum number of steps of an inflow for estimating its correlation."""
 
 
 @dataclass(frozen=True)
 class Regimes:
-    """Where slugs are rare: a Markov chain of two regimes, quiet and slug. ``ValueError`` naming
-    what is out of range."""
+    """Markov chain of two regimes, quiet and slug, for rare slugs. ``ValueError`` naming the
+    argument that is out of range."""
 
     p_onset: float
     """probability that a slug begins after a quiet step"""
     p_end: float
-    """probability that quiet begins after a step of a slug"""
+    """probability that a slug ends after a step"""
     quiet_variance_ratio: float
-    """variance of a quiet inflow, in parts of that within slugs"""
+    """variance of the inflow in the quiet regime, relative to that in slugs"""
 
     def __post_init__(self) -> None:
         _check.number("p_onset", self.p_onset, low=0.0, high=1.0, open_low=True)
@@ -52,21 +52,21 @@ class Regimes:
 
     @property
     def share(self) -> float:
-        """Of the steps in which a slug enters."""
+        """Fraction of the steps in which a slug enters."""
         return self.p_onset / (self.p_onset + self.p_end)
 
     @property
     def variance(self) -> float:
-        """Of all inflows, in parts of that within slugs."""
+        """Variance of all inflows, relative to that in slugs."""
         return self.share + (1.0 - self.share) * self.quiet_variance_ratio
 
 
 @dataclass(frozen=True, eq=False)
 class InflowPrior:
-    """u ~ N(0, Γ_time ⊗ Γ_across), u = c_in/ĉ_bh − 1 or ln(c_in/ĉ_bh) at the inlet's nodes.
+    """Prior u ~ N(0, Γ_time ⊗ Γ_across), u = c_in/ĉ_bh − 1 or ln(c_in/ĉ_bh) at the inlet's nodes.
 
     Γ_across = E Eᵀ with E the `modes`, and Γ_time is stationary: u = E x with independent rows of
-    x, each of unit variance and of this `correlation` in time. ``ValueError`` naming what is wrong.
+    x, each of unit variance and of this `correlation` in time. ``ValueError`` naming the argument.
     """
 
     link: str
@@ -74,15 +74,15 @@ class InflowPrior:
     points: np.ndarray
     """(n_inlet, d) m; the nodes of the model's inlet"""
     modes: np.ndarray
-    """(n_inlet, r) E, in parts of ĉ_bh"""
+    """(n_inlet, r) E, relative to ĉ_bh"""
     correlation: np.ndarray
-    """(K,) of two moments 0 … K − 1 time steps apart, the first 1; none beyond"""
+    """(K,) correlation at lags of 0 … K − 1 time steps, first entry 1; zero beyond"""
     time_step: float
     """s"""
     source: Mapping[str, Any] = field(default_factory=dict)
-    """where it comes from, fit for JSON"""
+    """provenance, serialisable as JSON"""
     regimes: Regimes | None = None
-    """for filters that tell slugs from quiet; None: not learned"""
+    """for filters that switch between slug and quiet; None: not estimated"""
 
     def __post_init__(self) -> None:
         if self.link not in LINK_NAMES:
@@ -99,38 +99,38 @@ class InflowPrior:
 
     @property
     def correlation_steps(self) -> int:
-        """Time steps from which on two moments have less than a tenth in common."""
+        """Lag in time steps from which on the correlation is below 0.1."""
         return int(np.flatnonzero(np.abs(self.correlation) >= 0.1)[-1]) + 1
 
     def inverse_link(self, u: np.ndarray) -> np.ndarray:
-        """c_in/ĉ_bh (..., n_inlet) for u of the same shape."""
+        """Return c_in/ĉ_bh (..., n_inlet) for u of the same shape."""
         return 1.0 + u if self.link == "linear" else np.exp(u)
 
     def inverse_link_derivative(self, u: np.ndarray) -> np.ndarray:
-        """Derivative of `inverse_link` by u, entry by entry."""
+        """Return the derivative of `inverse_link` by u, entry by entry."""
         return np.ones_like(u) if self.link == "linear" else np.exp(u)
 
     def time_covariance(self, steps: int) -> np.ndarray:
-        """(steps,) covariance of an entry of x with those 0 … steps − 1 time steps before."""
+        """Return the covariance (steps,) of an entry of x at lags of 0 … steps − 1 time steps."""
         entries = np.zeros(steps)
         known = min(steps, len(self.correlation))
         entries[:known] = self.correlation[:known]
         return entries
 
     def matches_task(self, task: Task) -> bool:
-        """Whether it was made for this task's inlet and time step."""
+        """Return whether the prior is for this task's inlet and time step."""
         there = task.mesh.points[task.transport.inlet]
         return (there.shape == self.points.shape
                 and bool(np.allclose(there, self.points, atol=NODE_ATOL_M))
                 and bool(np.isclose(self.time_step, task.transport.time_step)))
 
     def check_task(self, task: Task) -> None:
-        """``ValueError`` if it was made for another inlet or another time step."""
+        """Raise ``ValueError`` if the prior is for another inlet or another time step."""
         if not self.matches_task(task):
             raise ValueError(
-                f"the prior must be of the task's inlet, {len(task.transport.inlet)} nodes in "
-                f"steps of {task.transport.time_step:g} s; got one of {len(self.points)} nodes in "
-                f"steps of {self.time_step:g} s; make one by `eitbench fit prior`")
+                f"the prior must be for the task's inlet, {len(task.transport.inlet)} nodes in "
+                f"steps of {task.transport.time_step:g} s; got one for {len(self.points)} nodes in "
+                f"steps of {self.time_step:g} s; fit one with `eitbench fit prior`")
 
     def save(self, path: Path) -> None:
         """Write a file that `load` reads."""
@@ -145,7 +145,7 @@ class InflowPrior:
 
     @classmethod
     def load(cls, path: Path) -> InflowPrior:
-        """What `save` has written; ``ValueError`` naming the file if it is nothing of the kind."""
+        """Load a file that `save` wrote; ``ValueError`` naming the file if it is not valid."""
         try:
             said = json.loads(path.read_text(encoding="utf-8"))
             regimes = said.pop("regimes", None)
@@ -159,24 +159,24 @@ def fit_inflow_prior(ratios: np.ndarray, points: np.ndarray, time_step: float, *
                      link: str = "logarithm", nugget: float = 0.01, variance_cutoff: float = 1e-4,
                      quiet_threshold: float | None = None,
                      source: Mapping[str, Any] | None = None) -> InflowPrior:
-    """The prior that inflows of the past suggest.
+    """Fit a prior to sampled inflows.
 
-    Γ_across is the mean of u uᵀ over all moments. The correlation is the mean product of what lies
-    k steps apart, divided by the number of all steps and tapered to zero (Wendland 1995), so that
-    it stays a covariance whatever the sample is.
+    Γ_across is the mean of u uᵀ over all times. The correlation at lag k is the sum of products at
+    that lag, divided by the number of all steps and tapered to zero (Wendland 1995), so that it is
+    a valid covariance for every sample.
 
     Parameters
     ----------
     ratios : (N, T, n_inlet)
-        c_in over its usual level, > 0, of N episodes.
+        c_in relative to the background, > 0, of N episodes.
     points, time_step, link, source
         As in `InflowPrior`.
     nugget : float
-        Part of the variance that is white in time: what the model does not know of.
+        Fraction of the variance that is white in time, for unmodelled variation.
     variance_cutoff : float
-        Modes across the inlet of less than this part of the variance are left out.
+        Modes across the inlet with a smaller fraction of the variance are dropped.
     quiet_threshold : float, optional
-        Learn `Regimes` too: a step counts as quiet if |u| is less than this at all nodes.
+        Fit `Regimes` too: a step is quiet if |u| is less than this at all nodes.
     """
     ratios = _check.array("ratios", ratios, (None, None, len(points)))
     _check.number("nugget", nugget, low=0.0, high=1.0)
@@ -189,7 +189,7 @@ def fit_inflow_prior(ratios: np.ndarray, points: np.ndarray, time_step: float, *
         raise ValueError(f"ratios must be above 0, got {ratios.min():g}")
     u = ratios - 1.0 if link == "linear" else np.log(ratios)
     if not u.any():
-        raise ValueError("ratios must change, got inflows that are always the same")
+        raise ValueError("ratios must vary, got constant inflows")
     values, vectors = np.linalg.eigh(np.einsum("nti,ntj->ij", u, u) / (N * T))
     keep = values > variance_cutoff * values.sum()
     modes = (vectors[:, keep] * np.sqrt(values[keep]))[:, ::-1]
@@ -203,7 +203,7 @@ def fit_inflow_prior(ratios: np.ndarray, points: np.ndarray, time_step: float, *
 
 
 def _fit_regimes(u: np.ndarray, threshold: float) -> Regimes:
-    """How often slugs begin and end in u (N, T, n_inlet), and how quiet it is between them."""
+    """Return the regimes' parameters from u (N, T, n_inlet)."""
     _check.number("quiet_threshold", threshold, low=0.0, open_low=True)
     slug = np.abs(u).max(axis=2) >= threshold
     if slug.all() or not slug.any():
@@ -217,12 +217,12 @@ def _fit_regimes(u: np.ndarray, threshold: float) -> Regimes:
 
 
 def fit_prior_from_episodes(world: World, seeds: Sequence[int], **how: Any) -> InflowPrior:
-    """`fit_inflow_prior` from what flows in in these episodes, which are not simulated for it.
+    """Fit a prior to the inflows of these episodes, without simulating the episodes.
 
     ``ValueError`` if the world has no inflow, or an episode is not of the split ``train``.
     """
     if others := [seed for seed in seeds if seed not in SPLITS["train"]]:
-        raise ValueError("seeds must be of the split train, from which alone is learned; got "
+        raise ValueError("seeds must be of the split train, the only one for fitting; got "
                          f"{format_seed(others[0])}")
     inflows = np.array([world.sample_inflow(seed) for seed in seeds])
     mesh, inlet = world.vessel.transport_mesh(fine=False)
@@ -233,9 +233,9 @@ def fit_prior_from_episodes(world: World, seeds: Sequence[int], **how: Any) -> I
 def compatible_priors(folder: Path, task: Task, link: str) -> list[InflowPrior]:
     """Return the priors in a folder's files with this link, for this task's inlet and time step.
 
-    Priors learned in the task's own world come first, the others by file name. If several worlds
-    have such an inlet and none of them is the task's, a line names the world whose prior comes
-    first, since the inflow may differ from the task's.
+    Priors fitted in the task's world come first, then the others by file name. If several worlds
+    have such an inlet and none of them is the task's, a message names the world of the first prior,
+    since its inflow may differ from the task's.
     """
     priors = map(_loaded, sorted(folder.glob("*.json")))
     suiting = [prior for prior in priors if prior.link == link and prior.matches_task(task)]
@@ -248,13 +248,13 @@ def compatible_priors(folder: Path, task: Task, link: str) -> list[InflowPrior]:
 
 @lru_cache
 def _say_other_world(world: str, learned: str) -> None:
-    """Report once a process which prior stands in for a missing one."""
-    notify(f"no inflow prior was learned in {world!r}: that of {learned} is used; "
-        "make one by `eitbench fit prior`")
+    """Report once per process which prior replaces a missing one."""
+    notify(f"no inflow prior was fitted in {world!r}: the prior of {learned} is used; "
+           "fit one with `eitbench fit prior`")
 
 
 def nominal_worlds(name: str) -> set[str]:
-    """Return the name of a world and of the world that its estimators are told of."""
+    """Return the name of a world and, if it is shifted, of its nominal world."""
     homes = {each.nominal for each in entries().values()
              if each.nominal and each.world.name == name}
     return {name} | {entries()[home].world.name for home in homes}
@@ -262,16 +262,16 @@ def nominal_worlds(name: str) -> set[str]:
 
 @lru_cache(maxsize=16)
 def _loaded(path: Path) -> InflowPrior:
-    """Once a process, so that what is derived from it can be kept with it."""
+    """Load a prior once per process, so that caches can use its identity."""
     return InflowPrior.load(path)
 
 
 def source_world(source: Mapping[str, Any]) -> str | None:
-    """Name of the world in which something was learned that comes from there."""
+    """Return the name of the world in a fitted object's provenance, or None."""
     where = entries().get(source.get("environment", ""))
     return None if where is None else where.world.name
 
 
 def _rounded(array: np.ndarray) -> Any:
-    """Nested lists of nine digits, which is more than a sample knows."""
+    """Return nested lists rounded to nine digits, below the sampling error."""
     return np.vectorize(lambda entry: float(f"{entry:.9g}"), otypes=[float])(array).tolist()

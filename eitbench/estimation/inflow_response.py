@@ -1,4 +1,4 @@
-"""What past inflows leave in a pipe, in a flow that stays or changes (``docs/methods.md``, 10)."""
+"""Impulse response of a pipe to its inflow, in steady or changing flow (docs/methods.md, 10)."""
 
 from __future__ import annotations
 
@@ -14,25 +14,25 @@ if TYPE_CHECKING:
     from eitbench.physics.transport import Transport
 
 DECAY_TOLERANCE = 0.01
-"""The pipe has forgotten an inflow of which less than this part is left, in the Frobenius norm."""
+"""The response ends where a smaller fraction of an inflow remains, in the Frobenius norm."""
 MAX_RESPONSE_STEPS = 400
-"""Steps after which it has to be forgotten."""
+"""Largest number of steps of a response."""
 RANK_RTOL = 1e-3
-"""Directions that past inflows reach this much less than the first are left out."""
+"""Directions with smaller singular values of the response, relative to the first, are dropped."""
 
 
 class ImpulseResponse(NamedTuple):
-    """c_t = level + basis · Σ_k weights_k (c_in,t−k − level): what past inflows leave in a pipe."""
+    """Response to past inflows: c_t = c_ref + basis · Σ_k weights_k (c_in,t−k − c_ref)."""
 
     basis: np.ndarray
-    """(n, q) orthonormal: concentrations that inflows can make"""
+    """(n, q) orthonormal basis of the concentrations"""
     weights: np.ndarray
-    """(q, K, n_inlet) of the inflow k = 0 … K − 1 steps ago in the basis: Fᵏ Y in a steady flow"""
+    """(q, K, n_inlet) for the inflow k = 0 … K − 1 steps ago in the basis: Fᵏ Y in steady flow"""
 
 
 @lru_cache(maxsize=4)
 def steady_response(transport: Transport) -> ImpulseResponse:
-    """Of a flow that stays as it is; ``ValueError`` if it never forgets what flowed in."""
+    """Return the response of a steady flow; ``ValueError`` if it does not decay."""
     parts = _steady(transport)
     together = np.concatenate(parts, axis=1)
     # the smaller of both products holds the singular values
@@ -47,11 +47,10 @@ def steady_response(transport: Transport) -> ImpulseResponse:
 
 def time_varying_responses(transport_at: Callable[[int], Transport],
                            n_steps: int) -> list[ImpulseResponse]:
-    """Of the states t = 1 … n_steps in a flow that is ``transport_at(t)`` in the step to t, and was
-    as in the first step before; all in one basis, and of as many steps as the first flow needs to
-    forget an inflow.
+    """Return the responses of the states t = 1 … n_steps in a time-varying flow, in one basis.
 
-    ``ValueError`` if that never forgets what flowed in.
+    The flow is ``transport_at(t)`` in the step to t, and ``transport_at(1)`` before t = 0. All
+    responses are as long as the first one; ``ValueError`` if that does not decay.
     """
     n = transport_at(1).mesh.n_nodes
     squared = np.zeros((n, n))
@@ -59,16 +58,16 @@ def time_varying_responses(transport_at: Callable[[int], Transport],
         together = np.concatenate(parts, axis=1)
         squared += together @ together.T
     basis = _leading(squared)
-    # twice the same, since all of them would need gigabytes
+    # computed a second time, since storing all parts would take gigabytes
     return [_projected(parts, basis) for parts in _changing(transport_at, n_steps)]
 
 
 def reduced_response(response: ImpulseResponse, prior: InflowPrior, modes: int) -> ImpulseResponse:
-    """The same in so many directions, or all if there are fewer: those in which inflows of the
-    prior move the concentration most, strongest first.
+    """Return the response in at most ``modes`` directions, those with the largest prior variance of
+    the concentration, in descending order.
 
-    Those are the eigenvectors of B Γ_c Bᵀ with Γ_c the covariance of Σ_k W_k E x_{t−k}: that of the
-    concentration as far as it is linear in x.
+    The directions are the eigenvectors of B Γ_c Bᵀ with Γ_c the covariance of Σ_k W_k E x_{t−k},
+    the concentration linearised in x.
     """
     q, K, _ = response.weights.shape
     root = np.linalg.cholesky(toeplitz(prior.time_covariance(K)))
@@ -80,14 +79,14 @@ def reduced_response(response: ImpulseResponse, prior: InflowPrior, modes: int) 
 
 
 def one_step_response(transport: Transport) -> np.ndarray:
-    """Y (n, n_inlet): what an inflow leaves by the end of the step in which it comes."""
+    """Return Y (n, n_inlet), the response at the end of the step in which an inflow enters."""
     inlet = len(transport.inlet)
     return transport.step(np.zeros((transport.mesh.n_nodes, inlet)), 0.0, np.eye(inlet))
 
 
 def _changing(transport_at: Callable[[int], Transport],
               n_steps: int) -> Iterator[list[np.ndarray]]:
-    """What the inflows k = 0, 1, … steps before t leave of themselves (n, n_inlet), t = 1, 2, …"""
+    """Yield the responses (n, n_inlet) at t to inflows k = 0, 1, … steps before, t = 1, 2, …"""
     parts = _steady(transport_at(1))
     yield parts
     for t in range(2, n_steps + 1):
@@ -99,21 +98,21 @@ def _changing(transport_at: Callable[[int], Transport],
 
 
 def _steady(transport: Transport) -> list[np.ndarray]:
-    """Fᵏ Y (n, n_inlet) each, k = 0, 1, … until it is forgotten."""
+    """Return Fᵏ Y (n, n_inlet) for k = 0, 1, … until it has decayed."""
     F, Y = transport.transition()
     if not Y.shape[1]:
         raise ValueError("the transport must have an inlet, got one without")
     parts = [Y]
     while np.linalg.norm(parts[-1]) > DECAY_TOLERANCE * np.linalg.norm(Y):
         if len(parts) == MAX_RESPONSE_STEPS:
-            raise ValueError("the transport must forget an inflow within "
+            raise ValueError("the transport must have a response that decays within "
                              f"{MAX_RESPONSE_STEPS} steps")
         parts.append(F @ parts[-1])
     return parts
 
 
 def _leading(squared: np.ndarray) -> np.ndarray:
-    """(n, q) the directions that matter of M for M Mᵀ."""
+    """Return the leading left singular vectors (n, q) of M for M Mᵀ."""
     squares, directions = np.linalg.eigh(squared)
     return directions[:, squares > RANK_RTOL**2 * squares[-1]]
 

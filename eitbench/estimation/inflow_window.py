@@ -1,5 +1,4 @@
-"""Inflow window: the history of the inflow, from which the flow makes the concentration
-(docs/methods.md, 10)."""
+"""Inflow window: a state of past inflows that determine the concentration (methods.md, 10)."""
 
 from __future__ import annotations
 
@@ -26,13 +25,13 @@ class ArModel(NamedTuple):
     weights: np.ndarray
     """(W,)"""
     variance: float
-    """of the remainder"""
+    """variance of the residual"""
 
 
 def yule_walker(covariance: np.ndarray) -> tuple[np.ndarray, ArModel]:
     """Return the covariance (W, W) of W values and the regression of the next one (Yule–Walker).
 
-    ``covariance`` (W + 1,) has the covariances of two values 0 … W steps apart.
+    ``covariance`` (W + 1,) holds the covariances at lags of 0 … W steps.
     """
     before = toeplitz(covariance[:-1])
     weights = np.linalg.solve(before, covariance[1:])
@@ -42,21 +41,21 @@ def yule_walker(covariance: np.ndarray) -> tuple[np.ndarray, ArModel]:
 class InflowWindow(StateSpace):
     """Last inflows x_t … x_{t−W+1} (W·r,), the newest first, with u = E x the inflow's deviation.
 
-    In time they only move on, so that the prior is exact but for what lies more than W steps apart;
-    all nonlinearity is in the observation.
+    The evolution only shifts them, so that the prior is exact except for correlations beyond W
+    steps; only the observation model is nonlinear.
 
     Parameters
     ----------
     transport : Transport
-        Only for the default of ``responses``.
+        Used only for the default of ``responses``.
     prior : InflowPrior
     c_ref : float
         ĉ_bh in mol/m³.
     lag : int
-        The oldest state to be estimated, in steps before the present one.
+        Lag of the oldest state to be estimated, in time steps.
     responses : sequence of ImpulseResponse, optional
-        Of the states t = 1, 2, …, where the last holds from then on; default: that of the task's
-        flow for all.
+        Responses of the states t = 1, 2, …; the last one is used for all later states. Default:
+        the steady response of the task's flow.
     residual_covariance : (q, q), optional
         Covariance of the deviation from the response in its basis, relative to c_ref.
     """
@@ -70,7 +69,7 @@ class InflowWindow(StateSpace):
         self.residual_covariance = residual_covariance
         self.responses = responses or [steady_response(task.transport)]
         self.response_steps = self.responses[0].weights.shape[1]
-        """K, steps until the pipe has forgotten an inflow"""
+        """K, length of the response in time steps"""
         self.n_modes = prior.modes.shape[1]
         """r"""
         self.window_steps = self.response_steps + lag
@@ -127,18 +126,18 @@ class InflowWindow(StateSpace):
         """Return derivatives (m, K·r) by x from those by the inflows (m, K, n_inlet)."""
         by_u = by_inflow * (self.c_ref * self.prior.inverse_link_derivative(self._recent(mean, lag)
                                                           @ self.prior.modes.T))
-        # one product of matrices; of three dimensions it would be many small ones
+        # one product of two-dimensional arrays is faster than many small products
         by_x = by_u.reshape(-1, by_u.shape[-1]) @ self.prior.modes
         return by_x.reshape(len(by_inflow), -1)
 
     def _recent(self, mean: np.ndarray, lag: int) -> np.ndarray:
-        """Return the K inflows (..., K, r) that have made the state ``lag`` steps ago."""
+        """Return the K inflows (..., K, r) that determine the state ``lag`` steps ago."""
         values = mean.reshape(*mean.shape[:-1], -1, self.n_modes)
         return values[..., lag:lag + self.response_steps, :]
 
 
 def shift_window(mean: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """Return the mean (W·d,) of a window one step later, by the weights of `ArModel`."""
+    """Return the mean (W·d,) of a window one step later, with the weights of an `ArModel`."""
     values = mean.reshape(len(weights), -1)
     return np.concatenate([(weights * values).sum(axis=0)[None], values[:-1]]).ravel()
 
@@ -146,16 +145,16 @@ def shift_window(mean: np.ndarray, weights: np.ndarray) -> np.ndarray:
 def inflow_filter(task: Task, prior: InflowPrior, c_ref: float, lag: int = 0, *,
                   responses: Sequence[ImpulseResponse] | None = None,
                   model: IdentifiedModel | None = None, iterated: bool = False) -> Filter:
-    """Return the extended Kalman filter of the inflow's history.
+    """Return the extended Kalman filter of the inflow window.
 
     Parameters
     ----------
     task, prior, c_ref, lag, responses
         As in `InflowWindow`.
     model : IdentifiedModel, optional
-        Its response and its errors take the place of the task's flow.
+        Model whose response and errors replace the task's flow.
     iterated : bool
-        Each measurement is linearised once more, about the first estimate.
+        Linearise each measurement vector a second time, about the first estimate.
     """
     forward: Forward = linearise_at_prediction(task)
     if model is None:

@@ -1,4 +1,4 @@
-"""Inflow history and the flow that carries it, estimated together (docs/methods.md, 11)."""
+"""Joint estimation of inflow window and velocity (docs/methods.md, 11)."""
 
 from __future__ import annotations
 
@@ -22,23 +22,23 @@ class VelocityInflowWindow(StateSpace):
     """Last inflows x and velocities θ: z_t … z_{t−W+1}, z = (x, θ), the newest first (W·(r + k),).
 
     The concentration is c_t = F(θ_t) c_{t−1} + Y(θ_t) c_in(x_t). Linearised in θ at each prediction
-    it is a constant plus the contribution of each of the last W inflows and θ: these contributions
-    are propagated column by column. The link between c_in and x is linearised at each measurement
-    anew. What is older than W steps stays in the mean, but counts as known.
+    it is a constant plus the contributions of each of the last W inflows and θ, which are
+    propagated column by column. The link between c_in and x is linearised at each measurement
+    vector. Contributions older than W steps remain in the mean, without uncertainty.
 
-    θ stays within the flow's bounds; the concentration is conserved where it is moved back.
-    ``ValueError`` naming the argument if it is out of range, or the prior is of another inlet.
+    θ is projected onto the flow's bounds, without a change of the concentration. ``ValueError``
+    naming the argument if it is out of range, or if the prior is for another inlet.
 
     Parameters
     ----------
     task : Task
     prior : InflowPrior
-        Of the task's inlet.
+        Prior for the task's inlet.
     c_ref : float
         ĉ_bh in mol/m³.
     flow : VelocityPrior
     window_steps : int
-        W, time steps; the fluid should pass the pipe in fewer.
+        W in time steps; should exceed the residence time.
     """
 
     def __init__(self, task: Task, prior: InflowPrior, c_ref: float, flow: VelocityPrior,
@@ -64,7 +64,7 @@ class VelocityInflowWindow(StateSpace):
         self._initialise_window(W, k)
 
     def _initialise_window(self, W: int, k: int) -> None:
-        """Let past inflows fill the pipe at the nominal velocity."""
+        """Initialise the contributions of past inflows at the nominal velocity."""
         transport = self.flow.transport_at(self.flow.initial)
         self._inlet = transport.inlet
         parts = [one_step_response(transport)]
@@ -73,7 +73,7 @@ class VelocityInflowWindow(StateSpace):
         by_inflow = np.stack(parts, axis=1)
         n = len(by_inflow)
         self._constant = self.c_ref * (1.0 - by_inflow.sum(axis=(1, 2)))
-        """(n,) contribution of neither the last inflows nor the last θ"""
+        """(n,) part that depends on neither the last inflows nor the last θ"""
         self._parts = np.concatenate([by_inflow, np.zeros((n, W, k))], axis=2)
         """(n, W, n_inlet + k) contributions of c_in (mol/m³) and θ of each step, per unit"""
 
@@ -119,7 +119,7 @@ class VelocityInflowWindow(StateSpace):
         m = len(self._inlet)
         by_u = self.c_ref * self.prior.inverse_link_derivative(self._deviation(mean))
         by_inflow = parts[:, :, :m] * by_u
-        # one product of matrices; of three dimensions it would be many small ones
+        # one product of two-dimensional arrays is faster than many small products
         by_x = by_inflow.reshape(-1, m) @ self.prior.modes
         by_x = by_x.reshape(len(parts), self.window_steps, -1)
         return np.concatenate([by_x, parts[:, :, m:]], axis=2).reshape(len(parts), -1)

@@ -1,5 +1,5 @@
-"""Nodal state spaces: the concentration, or its logarithm, at the nodes; parameters of thesis
-Table 5.1, relative to ĉ_bh."""
+"""Nodal state spaces: the concentration or its logarithm at the nodes, with the parameters of
+thesis Table 5.1, relative to ĉ_bh."""
 
 from __future__ import annotations
 
@@ -28,12 +28,12 @@ if TYPE_CHECKING:
     from eitbench.worlds.world import Prior
 
 FILTER_RANK_TOLERANCE = 1e-4
-"""See `LowRankCovariance`: the estimates are those of the exact filter to 1e-7 of their standard
-deviation, in a quarter of the time where n = 3,003 (``docs/pipe3d.md``)."""
+"""Rank tolerance of `LowRankCovariance`: estimates differ from the exact filter by 1e-7 standard
+deviations, in a quarter of the time for n = 3,003 (``docs/pipe3d.md``)."""
 
 
 class Motion(NamedTuple):
-    """x⁺ = F x + s + w, w ~ N(0, Q), in one time step."""
+    """Evolution model of one time step, x⁺ = F x + s + w with w ~ N(0, Q)."""
 
     transition: Transition | None = None
     """F (n, n), or X (n, k) -> F X; None: identity"""
@@ -51,16 +51,16 @@ class Motion(NamedTuple):
 
 
 class NodalStates(StateSpace):
-    """Concentration at the nodes, with a motion that is known beforehand.
+    """Concentration at the nodes, with a given evolution model.
 
     Parameters
     ----------
     mean : (n,)
         c_{0|0} in mol/m³.
     covariance : Covariance
-        At t = 0; a `LowRankCovariance` must have the motion's F and Q.
+        Covariance at t = 0; a `LowRankCovariance` must have the motion's F and Q.
     motion : Motion or callable
-        Of each step, or t -> that of the step to t.
+        Motion of every step, or t -> motion of the step to t.
     """
 
     def __init__(self, mean: np.ndarray, covariance: Covariance,
@@ -105,7 +105,7 @@ class LogStates(StateSpace):
     Parameters
     ----------
     states : NodalStates
-        Of x; its mean begins at zero.
+        State space of x; the initial mean is replaced by zero.
     c_ref : float
         ĉ_bh in mol/m³.
     modes : (n, K), optional
@@ -140,15 +140,15 @@ class LogStates(StateSpace):
 
 
 def nodal_states(transport: Transport, prior: Prior, c_ref: float) -> NodalStates:
-    """Return the concentration of a target with a motion and the parameters of Table 5.1.
+    """Return the state space of a target's concentration with the parameters of Table 5.1.
 
-    Where fluid flows through the vessel they are those of `table_5_1_filter`. Where nothing flows
-    in, the covariance without data has no limit, and a dense covariance is kept.
+    `table_5_1_filter` uses it for a vessel with an inlet. Without an inlet the open-loop covariance
+    has no limit, and the covariance is dense.
 
     Parameters
     ----------
     transport
-        The evolution model; `Task.transport`.
+        Transport model, `Task.transport`.
     prior : Prior
         `Task.prior`.
     c_ref : float
@@ -171,10 +171,10 @@ def nodal_states(transport: Transport, prior: Prior, c_ref: float) -> NodalState
 
 def modal_states(n_modes: int, std: float,
                  motion: Callable[[int], tuple[np.ndarray, np.ndarray]]) -> NodalStates:
-    """Return independent weights of ``n_modes`` modes that all move alike, of variance ``std``².
+    """Return the state space of ``n_modes`` independent mode weights of variance ``std``².
 
-    Each is the first of p numbers, such as a weight and its rate of change, which move by A (p, p)
-    with noise Q (p, p) for a variance of 1; ``motion`` gives both for the step to t.
+    Each weight is the first of p numbers, such as a weight and its rate of change, which evolve
+    with A (p, p) and noise Q (p, p) for a variance of 1; ``motion`` returns both for the step to t.
     """
     order = len(motion(1)[0])
 
@@ -191,18 +191,18 @@ def modal_states(n_modes: int, std: float,
 
 
 def nodal_filter(transport: Transport, prior: Prior, c_ref: float,
-                    forward: Forward | None = None) -> Filter:
+                 forward: Forward | None = None) -> Filter:
     """Return a filter of `nodal_states` at t = 0."""
     return Filter(nodal_states(transport, prior, c_ref), forward)
 
 
 def table_5_1_filter(transport: Transport, prior: Prior, c_ref: float, *,
-              rank_tolerance: float = FILTER_RANK_TOLERANCE) -> Filter:
+                     rank_tolerance: float = FILTER_RANK_TOLERANCE) -> Filter:
     """Return the Kalman filter of c⁺ = F c + Y c_in + w; arguments as in `nodal_states`.
 
     Inflow and initial state have mean ĉ_bh; Γ_η and Γ_e are diagonal, Γ_{0|0} is diagonal or
-    smooth. As all of them scale with ĉ_bh², the covariance without data is computed once for a
-    transport model and serves every episode.
+    smooth. As all of them scale with ĉ_bh², the open-loop covariance is computed once per transport
+    model and used in all episodes.
     """
     return Filter(_flowing_states(transport, prior, c_ref, rank_tolerance))
 
@@ -215,7 +215,7 @@ def _flowing_states(transport: Transport, prior: Prior, c_ref: float,
 
 
 def initial_covariance(mesh: Mesh, prior: Prior) -> np.ndarray:
-    """Γ_{0|0} (n, n) for ĉ_bh = 1: diagonal, or smooth over `Prior.initial_length`; read-only."""
+    """Return Γ_{0|0} (n, n) for ĉ_bh = 1: diagonal, or smooth over `Prior.initial_length`."""
     if not prior.initial_length:
         return prior.initial_std**2 * np.eye(mesh.n_nodes)
     return _smooth(mesh, prior.initial_length, prior.initial_std)
@@ -237,6 +237,6 @@ def _open_loop(transport: Transport, prior: Prior) -> OpenLoopCovariance:
 
 @lru_cache(maxsize=4)
 def _state_noise(transport: Transport, prior: Prior) -> np.ndarray:
-    """Γ_w (5.16) for ĉ_bh = 1."""
+    """Return Γ_w (5.16) for ĉ_bh = 1."""
     model = transport.evolution_model()
     return model.state_noise_covariance(prior.inflow_std**2, prior.nodal_std**2)

@@ -10,27 +10,27 @@ import numpy as np
 from eitbench import _check
 
 DIFFERENCE_STEP = 0.1
-"""By how much a mode raises the logarithm, root mean square, where differences are taken."""
+"""Step of the finite differences: root mean square change of the logarithm by a mode."""
 CACHE_BYTES = 2**27
-"""Memory for what a model keeps of each injection: in 2D that of 250, more than there are pairs."""
+"""Memory for cached arrays per model: in 2D enough for 250 injections, more than all pairs."""
 
 
 class TransferResistanceModel(Protocol):
-    """What the quadratic is of; such as `ObservationModel`."""
+    """Model of transfer resistances, such as `ObservationModel`."""
 
     min_concentration: float
-    """mol/m³, as which what is below counts"""
+    """mol/m³, lower bound to which smaller concentrations are raised"""
 
     def resistance_derivatives(self, concentration: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Transfer resistances (L, L) in Ω (Ω·m in 2D), and by each node's c (n, L, L)."""
+        """Return transfer resistances (L, L) in Ω (Ω·m in 2D), and derivatives (n, L, L) by c."""
 
 
 class QuadraticVoltageModel:
-    """𝓡(c) = 𝓡_0 + Σ_i D_i u_i + ½ Σ_jk H_jk a_j a_k, with u = ln(c/c_0) and a its modes.
+    """Voltages with 𝓡(c) = 𝓡_0 + Σ_i D_i u_i + ½ Σ_jk H_jk a_j a_k, u = ln(c/c_0), a its modes.
 
-    D is exact; H are central differences of the model's derivatives. About c_0 it costs a hundredth
-    of solving for the potential, and slugs of ours are told to a fraction of the noise. It is a
-    `VoltageModel`. ``ValueError`` naming the argument if it is out of range or of the wrong shape.
+    D is exact; H are central differences of the model's derivatives. It costs one hundredth of
+    solving for the potential; for slugs of the built-in worlds the error is a fraction of the
+    noise. It is a `VoltageModel`. ``ValueError`` naming the argument of a wrong range or shape.
 
     Parameters
     ----------
@@ -38,7 +38,7 @@ class QuadraticVoltageModel:
     c_ref : float
         c_0 in mol/m³.
     modes : (n, q)
-        Of u, linearly independent; what they leave of u enters linearly.
+        Linearly independent modes of u; the remainder of u enters linearly.
     """
 
     def __init__(self, model: TransferResistanceModel, c_ref: float, modes: np.ndarray) -> None:
@@ -58,19 +58,19 @@ class QuadraticVoltageModel:
         L = self._resistance.shape[0]
         injections = CACHE_BYTES // (8 * L * (n + q * q))
         self.tables = self._resistance, self._slope, self._to_modes, self._curvature
-        """𝓡_0 (L, L), D (n, L·L), the modes by u (q, n), and H (q, q, L·L)"""
+        """𝓡_0 (L, L), D (n, L·L), the map (q, n) from u to modes, and H (q, q, L·L)"""
         self._of_injection = lru_cache(maxsize=max(1, injections))(self._contracted)
 
     def _by_mode(self, model: TransferResistanceModel, modes: np.ndarray,
                  u: np.ndarray) -> np.ndarray:
-        """(q, L·L) derivatives by the modes at ln(c/c_0) = u."""
+        """Return the derivatives (q, L·L) by the modes at ln(c/c_0) = u."""
         c = self.c_ref * np.exp(u)
         table = model.resistance_derivatives(c)[1]
         by_mode: np.ndarray = (modes.T * c) @ table.reshape(len(c), -1)
         return by_mode
 
     def _contracted(self, currents: bytes) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Voltages (L,) at c_0, their derivatives (L, n) by u, and (L, q, q) the second ones."""
+        """Return voltages (L,) at c_0, first derivatives (L, n) by u, and second (L, q, q)."""
         I = np.frombuffer(currents)
         L = len(I)
         slope = (self._slope.reshape(-1, L, L) @ I).T
@@ -79,13 +79,13 @@ class QuadraticVoltageModel:
         return self._resistance @ I, np.ascontiguousarray(slope), np.ascontiguousarray(curvature)
 
     def voltages(self, concentration: np.ndarray, currents: np.ndarray) -> np.ndarray:
-        """(K, L) V for currents (K, L) in A (A/m in 2D) and a concentration (n,) in mol/m³."""
+        """Return V (K, L) for currents (K, L) in A (A/m in 2D) and concentration (n,) in mol/m³."""
         u, a, _ = self._logarithm(concentration)
         return np.array([self._voltages(u, a, *self._of(each))[0] for each in currents])
 
     def linearise(self, concentration: np.ndarray,
                   currents: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Voltages (K, L) in V and their derivatives by c, (K, L, n) in V·m³/mol."""
+        """Return voltages (K, L) in V and derivatives by c, (K, L, n) in V·m³/mol."""
         u, a, c = self._logarithm(concentration)
         found = []
         for each in currents:
@@ -100,12 +100,12 @@ class QuadraticVoltageModel:
 
     def _voltages(self, u: np.ndarray, a: np.ndarray, constant: np.ndarray, slope: np.ndarray,
                   curvature: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """(L,) V, and (L, q) what the second derivatives add to those by the modes."""
+        """Return voltages (L,) in V, and the quadratic part (L, q) of the derivatives by modes."""
         bent = curvature @ a
         return constant + slope @ u + 0.5 * bent @ a, bent
 
     def _logarithm(self, concentration: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """u, its modes, and c with too small ones raised."""
+        """Return u, its modes, and c clipped from below."""
         c = np.maximum(concentration, self.smallest)
         u = np.log(c / self.c_ref)
         return u, self._to_modes @ u, c
@@ -115,8 +115,8 @@ class ScaledVoltageModel:
     """Voltages that are quadratic at any c_ref: 𝓡(c) = e^−ū 𝓖(u), with u = ln(c/c_0), ū its mean
     over the nodes, and 𝓖 = e^ū 𝓡 as in `QuadraticVoltageModel`.
 
-    Were it not for the contacts, 𝓖 would be the same at all levels. It is a `VoltageModel`;
-    arguments and ``ValueError`` as there.
+    Without contact impedances, 𝓖 would not depend on ū. It is a `VoltageModel`; arguments and
+    ``ValueError`` as in `QuadraticVoltageModel`.
     """
 
     def __init__(self, model: TransferResistanceModel, c_ref: float, modes: np.ndarray) -> None:
@@ -127,13 +127,13 @@ class ScaledVoltageModel:
         self.quadratic = QuadraticVoltageModel(_Scaled(model, c_ref), c_ref, with_level)
 
     def voltages(self, concentration: np.ndarray, currents: np.ndarray) -> np.ndarray:
-        """(K, L) V for currents (K, L) in A (A/m in 2D) and a concentration (n,) in mol/m³."""
+        """Return V (K, L) for currents (K, L) in A (A/m in 2D) and concentration (n,) in mol/m³."""
         c = np.maximum(concentration, self.smallest)
         return self.quadratic.voltages(c, currents) / _scale(c, self.c_ref)
 
     def linearise(self, concentration: np.ndarray,
                   currents: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Voltages (K, L) in V and their derivatives by c, (K, L, n) in V·m³/mol."""
+        """Return voltages (K, L) in V and derivatives by c, (K, L, n) in V·m³/mol."""
         c = np.maximum(concentration, self.smallest)
         scaled, by_c = self.quadratic.linearise(c, currents)
         scale = _scale(c, self.c_ref)
@@ -141,7 +141,7 @@ class ScaledVoltageModel:
 
 
 class _Scaled:
-    """𝓖 and its derivatives."""
+    """Scaled resistances 𝓖 and their derivatives."""
 
     def __init__(self, model: TransferResistanceModel, c_ref: float) -> None:
         self.model = model
@@ -156,5 +156,5 @@ class _Scaled:
 
 
 def _scale(c: np.ndarray, c_ref: float) -> float:
-    """e^ū"""
+    """Return e^ū."""
     return float(np.exp(np.log(c / c_ref).mean()))

@@ -1,9 +1,8 @@
-"""A Kalman filter in few coordinates, for very many records at once.
+"""Reduced-order Kalman filter for many episodes at once.
 
-The filter's mean moves away from the prior mean only within the span of Z (P = Π − Z Zᵀ). The
-directions that carry most of Z Zᵀ, as measured by the mass matrix, are therefore the best
-coordinates for its estimates; Galerkin's projection onto them gives a model of the same form with
-about a hundred states.
+The filter's mean differs from the prior mean only within the span of Z (P = Π − Z Zᵀ). The leading
+eigenvectors of Z Zᵀ, weighted by the mass matrix, are therefore the best coordinates for its
+estimates; a Galerkin projection onto them yields a model of the same form with about 100 states.
 """
 
 from __future__ import annotations
@@ -23,7 +22,7 @@ from eitbench.estimation.nodal import NodalStates
 
 
 class ReducedModel(NamedTuple):
-    """a⁺ = A a + w for deviations c − s = Φ a from what the deterministic input alone gives."""
+    """Model a⁺ = A a + w of deviations c − s = Φ a from the response s to deterministic inputs."""
 
     basis: np.ndarray
     """(n, r) Φ, with Φᵀ M Φ = I"""
@@ -38,20 +37,20 @@ class ReducedModel(NamedTuple):
 def reduced_model(start: Filter, mass: np.ndarray,
                   observations: Iterable[LinearMeasurement], rank: int, *,
                   skip: int = 20) -> ReducedModel:
-    """The model of ``start`` in the ``rank`` directions in which it learns most.
+    """Return the model of ``start`` in the ``rank`` directions of largest covariance reduction.
 
     Parameters
     ----------
     start : Filter
-        Of `NodalStates` at t = 0; it is run over the record.
+        Filter of `NodalStates` at t = 0; it is run over the observations.
     mass : (n, n)
         Mass matrix M in m² (m³ in 3D).
     observations
-        A record with injections as they will be used; the values do not matter.
+        Measurement sequence with representative injections; the values are not used.
     rank : int
         r.
     skip : int
-        Steps at the beginning that do not count, since the initial uncertainty is not typical.
+        Number of initial steps to omit, since the initial uncertainty is not representative.
     """
     space = start.space
     assert isinstance(space, NodalStates)
@@ -67,7 +66,7 @@ def reduced_model(start: Filter, mass: np.ndarray,
 
 def covariance_reduction(start: Filter, observations: Iterable[LinearMeasurement],
                          skip: int) -> np.ndarray:
-    """Return the reduction (n, n) of the covariance by a record, summed after ``skip`` steps."""
+    """Return the reduction (n, n) of the covariance by updates, summed after ``skip`` steps."""
     open_loop = start.covariance.copy()
     total = np.zeros((len(start.mean), len(start.mean)))
     for t, observation in enumerate(observations):
@@ -86,7 +85,7 @@ def covariance_reduction(start: Filter, observations: Iterable[LinearMeasurement
 
 
 def dominant_directions(reduction: np.ndarray, mass: np.ndarray, rank: int) -> np.ndarray:
-    """(n, r) directions of most ``reduction`` (n, n) by the mass matrix M: Φᵀ M Φ = I."""
+    """Return the leading directions Φ (n, r) of ``reduction`` (n, n), with Φᵀ M Φ = I."""
     root = np.linalg.cholesky(mass)
     n = len(mass)
     _, vectors = scipy.linalg.eigh(root.T @ reduction @ root, subset_by_index=[n - rank, n - 1])
@@ -97,20 +96,20 @@ def dominant_directions(reduction: np.ndarray, mass: np.ndarray, rank: int) -> n
 def matvec(matrix: np.ndarray, vectors: np.ndarray) -> np.ndarray:
     """Return products (B, m) of a matrix (m, n) or matrices (B, m, n) and vectors (B, n).
 
-    They are computed one by one: the bits of one product with all vectors depend on their number.
+    They are computed one by one: the rounding of a joint product depends on the number of vectors.
     """
     return np.asarray((matrix @ vectors[..., None])[..., 0])
 
 
 class ReducedStates(Protocol):
-    """State space of few coordinates for B episodes side by side, in the precision of its arrays.
+    """Reduced state space for a batch of B episodes, in the precision of its arrays.
 
-    The state has s entries, the concentration q coordinates in a basis. The numbers of an episode
-    do not depend on the other episodes, to the bit.
+    The state has s entries, the concentration q coordinates in a basis. The results of an episode
+    are bit-identical for all compositions of the batch.
     """
 
     basis: np.ndarray
-    """(n, q) of the concentration's deviation relative to its level"""
+    """(n, q) basis of the concentration's deviation, relative to c_ref"""
 
     def initial(self) -> tuple[np.ndarray, np.ndarray]:
         """Return mean (s,) and covariance (s, s) at t = 0."""
@@ -120,8 +119,8 @@ class ReducedStates(Protocol):
         """Return mean (B, s) and covariance (B, s, s) one time step later."""
 
     def step(self, mean: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return the derivative of a step at a mean (s,), the covariance of its noise, (s, s)
-        each, and the mean after it."""
+        """Return the Jacobian of a step at a mean (s,), its noise covariance, (s, s) each, and the
+        mean after it."""
 
     def coordinates(self, mean: np.ndarray) -> np.ndarray:
         """Return the coordinates (B, q) of the concentration."""
@@ -135,7 +134,7 @@ class ReducedStates(Protocol):
 
 
 class SteadyStates:
-    """State space of a `ReducedModel`: the coordinates of the concentration. A `ReducedStates`."""
+    """State space of a `ReducedModel`, the coordinates of the concentration; a `ReducedStates`."""
 
     def __init__(self, model: ReducedModel) -> None:
         self.model = model
@@ -154,7 +153,7 @@ class SteadyStates:
                   covariance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         A = self.model.transition
         AP, APA = np.empty_like(covariance), np.empty_like(covariance)
-        for begin, end in pairwise(self._edges):                     # below its blocks A is zero
+        for begin, end in pairwise(self._edges):              # A is block upper triangular
             np.matmul(A[begin:end, begin:], covariance[:, begin:], out=AP[:, begin:end])
         for begin, end in pairwise(self._edges):
             np.matmul(AP[:, :, begin:], A[begin:end, begin:].T, out=APA[:, :, begin:end])
@@ -175,7 +174,7 @@ class SteadyStates:
 
 
 class ReducedFilter:
-    """Kalman filter of B episodes side by side, each with its own injections.
+    """Kalman filters of a batch of B episodes, each with its own injections.
 
     Parameters
     ----------
@@ -186,9 +185,9 @@ class ReducedFilter:
     Attributes
     ----------
     mean, covariance : (B, s), (B, s, s)
-        Of the present states.
+        Means and covariances of the present states.
     innovation_covariance : (B, m, m)
-        S of the last measurement; rows and columns of rejected readings are of the identity.
+        Last S; rows and columns of rejected measurements equal the identity.
     """
 
     def __init__(self, states: ReducedStates, episodes: int) -> None:
@@ -204,10 +203,10 @@ class ReducedFilter:
 
     def update(self, matrix: np.ndarray, innovation: np.ndarray, noise_variance: np.ndarray, *,
                gate: float = math.inf) -> tuple[np.ndarray, np.ndarray]:
-        """Condition on innovations (B, m) of readings with derivatives (B, m, s) and noise (B, m).
+        """Condition on innovations (B, m), with derivatives (B, m, s) and noise variances (B, m).
 
-        Readings beyond the ``gate`` are rejected. Returns the predicted variances of all, and which
-        were accepted, (B, m) each.
+        Measurements beyond the ``gate`` are rejected. Returns all predicted variances and the mask
+        of accepted measurements, (B, m) each.
         """
         P = self.covariance
         m = matrix.shape[1]
@@ -216,7 +215,7 @@ class ReducedFilter:
         S[:, np.arange(m), np.arange(m)] += noise_variance
         variance = S.diagonal(axis1=1, axis2=2).copy()
         accepted = gate_mask(innovation, variance, gate)
-        if not accepted.all():  # a rejected reading does not depend on the state
+        if not accepted.all():  # remove rejected measurements from the update
             cross = cross * accepted[..., None]
             innovation = innovation * accepted
             S *= accepted[:, :, None] & accepted[:, None, :]

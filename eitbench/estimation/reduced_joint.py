@@ -1,8 +1,8 @@
-"""Concentration and mean velocity estimated together in few coordinates, for very many records.
+"""Reduced-order joint filter of concentration and mean velocity, for many episodes at once.
 
-`VelocityStates` makes F(θ) anew at every step. Projected onto a basis Φ that serves all velocities
-(see `eitbench.estimation.reduced`) F(θ) is a smooth function of θ with small values: a cubic spline
-through a few velocities gives it, and its derivative, at any other.
+`VelocityStates` recomputes F(θ) at every step. Projected onto one basis Φ for all velocities (see
+`eitbench.estimation.reduced`), F(θ) is a small matrix that depends smoothly on θ: a cubic spline
+through a few velocities interpolates it and its derivative.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from eitbench.estimation.reduced import matvec
 
 
 class JointModel(NamedTuple):
-    """a⁺ = A(θ) a + w, θ⁺ = θ + ω, for c − s = Φ a about a liquid that the flow leaves as it is."""
+    """Model a⁺ = A(θ) a + w, θ⁺ = θ + ω of c − s = Φ a about a homogeneous liquid s."""
 
     basis: np.ndarray
     """(n, r) Φ, with Φᵀ M Φ = I"""
@@ -37,7 +37,7 @@ class TransitionSplines:
     ----------
     model : JointModel
     dtype : numpy float type
-        Of the tables and of what they give.
+        Type of the tables and of the results.
     """
 
     def __init__(self, model: JointModel, dtype: type = np.float64) -> None:
@@ -46,13 +46,13 @@ class TransitionSplines:
         self._noise = self._coefficients(model.noise, dtype)
 
     def _coefficients(self, table: np.ndarray, dtype: type) -> np.ndarray:
-        """(K − 1, 4, r, r) those of (θ − θ_k)³ … 1."""
-        from scipy.interpolate import CubicSpline  # half a second, for those who need it
+        """Return the coefficients (K − 1, 4, r, r) of (θ − θ_k)³ … 1."""
+        from scipy.interpolate import CubicSpline  # lazy import: takes half a second
         coefficients = np.moveaxis(CubicSpline(self.velocities, table).c, 0, 1)
         return np.ascontiguousarray(coefficients.astype(dtype))
 
     def evaluate(self, velocity: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """A(θ), dA/dθ and w's covariance, (B, r, r) each; θ (B,) in m/s, kept within the table."""
+        """Return A(θ), dA/dθ and cov(w), (B, r, r) each; θ (B,) in m/s is clipped to the table."""
         knots = self.velocities
         theta = np.clip(np.asarray(velocity, dtype=float), knots[0], knots[-1])
         part = np.clip(np.searchsorted(knots, theta, side="right") - 1, 0, len(knots) - 2)
@@ -64,9 +64,9 @@ class TransitionSplines:
 
 
 class JointStates:
-    """State space of a `JointModel`: (a, θ), as in `VelocityStates`, θ in m/s. A `ReducedStates`.
+    """State space of a `JointModel`: (a, θ), as in `VelocityStates`, θ in m/s; a `ReducedStates`.
 
-    Deviations move with [[A, (dA/dθ) a], [0, 1]].
+    Deviations are propagated with [[A, (dA/dθ) a], [0, 1]].
 
     Parameters
     ----------
@@ -76,7 +76,7 @@ class JointStates:
     bounds : (float, float)
         m/s, least and largest θ.
     dtype : numpy float type
-        In which the filter works.
+        Precision of the filter.
     """
 
     def __init__(self, model: JointModel, nominal: float, std: float, walk_std: float,
@@ -120,7 +120,7 @@ class JointStates:
         return mean[:, :-1]
 
     def jacobian(self, mean: np.ndarray, matrix: np.ndarray) -> np.ndarray:
-        blind = np.zeros((*matrix.shape[:-1], 1), matrix.dtype)  # θ itself is not seen
+        blind = np.zeros((*matrix.shape[:-1], 1), matrix.dtype)  # voltages do not depend on θ
         return np.concatenate([matrix, blind], axis=-1)
 
     def constrain(self, mean: np.ndarray) -> np.ndarray:
@@ -135,11 +135,11 @@ def _moved(transition: np.ndarray, mean: np.ndarray) -> np.ndarray:
 
 def joint_model(basis: np.ndarray, mass: np.ndarray, initial: np.ndarray, velocities: np.ndarray,
                 steps: Iterable[tuple[np.ndarray, np.ndarray]]) -> JointModel:
-    """Galerkin's projection onto ``basis`` of F(θ) and Γ_w(θ), (n, n) at each of ``velocities``."""
+    """Project F(θ) and Γ_w(θ), (n, n) at each of ``velocities``, onto ``basis`` (Galerkin)."""
     weighted = mass @ basis
     transition = []
     noise = []
-    for F, state_noise in steps:                           # one at a time: they are large
+    for F, state_noise in steps:                           # one at a time, to save memory
         transition.append(weighted.T @ (F @ basis))
         noise.append(weighted.T @ (state_noise @ weighted))
     return JointModel(basis, np.asarray(velocities, dtype=float), np.array(transition),

@@ -1,4 +1,4 @@
-"""Smoothing that inverts and stores no n×n matrix (Bryson & Frazier 1963; docs/methods.md, 6)."""
+"""Bryson–Frazier smoothers without inverses of n×n matrices (1963; docs/methods.md, 6)."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ from eitbench.worlds.task import Estimate
 
 def fixed_interval_smoother(start: Filter,
                             observations: Iterable[LinearMeasurement]) -> list[Estimate]:
-    """Return c_{t|T} and its variances for t = 1 … T: filter the record, then go back over it.
+    """Return c_{t|T} and its variances for t = 1 … T, by a forward and a backward pass.
 
-    ``start`` has a `LowRankCovariance` and a motion that does not change.
+    ``start`` must have a `LowRankCovariance` and a time-invariant motion.
     """
     steps = kalman_filter(start, observations)
     return [_smoothed(step, adjoint) for step, adjoint in _backwards(start, steps)][::-1]
 
 
 def smooth_state(filter_: Filter, steps: Sequence[Step]) -> Estimate:
-    """Return the state of the first of consecutive ``steps``, given the measurements of all.
+    """Return the state of the first of consecutive ``steps``, given the measurements of all steps.
 
     With the last k + 1 steps of ``filter_`` this is the fixed-lag smoother c_{t−k|t}.
     """
@@ -34,11 +34,11 @@ def smooth_state(filter_: Filter, steps: Sequence[Step]) -> Estimate:
 
 
 def smooth_means(start: Filter, observations: Iterable[LinearMeasurement]) -> np.ndarray:
-    """Return the means c_{t|T} (T, n) of a filter of `NodalStates`, whose motion may change.
+    """Return the means c_{t|T} (T, n) of a filter of `NodalStates` with any motion.
 
-    The adjoint λ_t = Hᵀ S⁻¹ ν + (I − K H)ᵀ Fᵀ_{t+1} λ_{t+1} runs back over the innovations, and the
-    smoothed state follows forwards from c_{0|T} = c_{0|0} + Γ_{0|0} F₁ᵀ λ_1 as c_t = F_t c_{t−1} +
-    s_t + Γ_w λ_t (``docs/methods.md``, 6): without variances, and without storing covariances.
+    The adjoint λ_t = Hᵀ S⁻¹ ν + (I − K H)ᵀ Fᵀ_{t+1} λ_{t+1} is computed backwards, and the smoothed
+    state forwards, from c_{0|T} = c_{0|0} + Γ_{0|0} F₁ᵀ λ_1 by c_t = F_t c_{t−1} + s_t + Γ_w λ_t
+    (``docs/methods.md``, 6). No variances are computed and no covariances stored.
     """
     assert isinstance(start.space, NodalStates)
     space = start.space
@@ -61,9 +61,9 @@ def smooth_means(start: Filter, observations: Iterable[LinearMeasurement]) -> np
 
 
 def _backwards(filter_: Filter, steps: Sequence[Step]) -> Iterator[tuple[Step, np.ndarray]]:
-    """Yield (step, [λ, B]) from the last step to the first: information of its own and later data.
+    """Yield (step, [λ, B]) from the last step to the first, from data of this and later steps.
 
-    The adjoint λ and the information N = B Bᵀ obey, with S = L Lᵀ,
+    The adjoint λ and the information N = B Bᵀ satisfy, with S = L Lᵀ,
         λ_t = Hᵀ S⁻¹ ν + (I − K H)ᵀ Fᵀ λ_{t+1},        B_t = [Hᵀ L⁻ᵀ, (I − K H)ᵀ Fᵀ B_{t+1}].
     B is truncated to its numerical rank like the filter's Z.
     """

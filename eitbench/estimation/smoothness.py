@@ -1,4 +1,4 @@
-"""Smoothness priors: neighbouring values of the target are alike."""
+"""Smoothness priors: spatially correlated Gaussian fields."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from eitbench import _check
 
 def smoothness_covariance(mass: sp.csr_array, stiffness: sp.csr_array, length: float,
                           std: float) -> np.ndarray:
-    """Γ = s·(M + ℓ²K)⁻¹ M (M + ℓ²K)⁻¹, (n, n): a proper smoothness prior.
+    """Return Γ = s·(M + ℓ²K)⁻¹ M (M + ℓ²K)⁻¹, (n, n), a proper smoothness prior.
 
-    The field x solves x − ℓ²∆x = white noise with ∂x/∂n = 0 on the wall: in free space a Matérn
-    field, whose correlation falls to 0.60 at a distance of ℓ and 0.12 at 3ℓ (Lindgren, Rue &
-    Lindström 2011). In 3D it is rougher than in 2D. s makes the mean variance, weighted by M, std².
-    Gauss–Newton takes Γ⁻¹ as its penalty.
+    The field x solves x − ℓ²∆x = white noise with ∂x/∂n = 0 on the wall: in free space it is a
+    Matérn field with correlation 0.60 at distance ℓ and 0.12 at 3ℓ (Lindgren, Rue & Lindström
+    2011), rougher in 3D than in 2D. The factor s scales the mean variance, weighted by M, to std².
+    Gauss–Newton uses Γ⁻¹ as its penalty.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Filtering the history of an inflow in which slugs are rare (``docs/methods.md``, 15)."""
+"""Filters for inflows with rare slugs: two regimes of the inflow (``docs/methods.md``, 15)."""
 
 from __future__ import annotations
 
@@ -27,23 +27,23 @@ NEGLIGIBLE = 1e-3
 
 
 class SwitchingInflowFilter:
-    """Interacting multiple models (Blom & Bar-Shalom 1988) of what enters: quiet, or a slug.
+    """Interacting multiple models (Blom & Bar-Shalom 1988) of the inflow: quiet, or a slug.
 
-    Two filters of an `InflowWindow` run side by side. In a slug a new x follows by the prior's
-    regression; in quiet it is independent and small. Before each step the first two moments of
-    both are mixed by the probabilities of the preceding regimes, which each measurement updates by
-    its likelihood. A homogeneous deviation from c_ref, which remains where a slug was in the
-    first frame, is a separate mode that does not change.
+    Two filters of an `InflowWindow` run in parallel. In a slug a new x follows the prior's
+    regression; in the quiet regime it is independent and small. Before each step the means and
+    covariances are mixed with the probabilities of the preceding regimes, which each measurement
+    vector updates by its likelihood. A homogeneous deviation from c_ref, which occurs if a slug was
+    in the first frame, is a separate constant mode.
 
     Parameters
     ----------
     task : Task
     prior : InflowPrior
-        Of the task's inlet and with `Regimes`; ``ValueError`` if it is not.
+        Prior for the task's inlet with `Regimes`; ``ValueError`` otherwise.
     c_ref : float
         ĉ_bh in mol/m³.
     level_std : float
-        Of what enters between slugs, relative to ĉ_bh, > 0.
+        Standard deviation of the background between slugs, relative to ĉ_bh, > 0.
     forward : callable
         Linearises voltages about a concentration; for `assimilate`.
     """
@@ -51,7 +51,7 @@ class SwitchingInflowFilter:
     def __init__(self, task: Task, prior: InflowPrior, c_ref: float, level_std: float,
                  forward: Forward) -> None:
         if prior.regimes is None:
-            raise ValueError("prior must have regimes, got one without; make one by "
+            raise ValueError("prior must have regimes, got one without; fit one with "
                              "`eitbench fit prior --quiet`")
         _check.number("level_std", level_std, low=0.0, open_low=True)
         regimes = prior.regimes
@@ -60,7 +60,7 @@ class SwitchingInflowFilter:
         within = replace(prior, modes=modes)
         spaces = [InflowWindow(task, within, c_ref) for _ in range(2)]
         self.probabilities = np.array([1.0 - regimes.share, regimes.share])
-        """(2,) that the present regime is quiet, or a slug"""
+        """(2,) probabilities of the present regime: quiet, slug"""
         self._transitions = np.array([[1.0 - regimes.p_onset, regimes.p_onset],
                                       [regimes.p_end, 1.0 - regimes.p_end]])
         r = modes.shape[1]
@@ -75,7 +75,7 @@ class SwitchingInflowFilter:
         spaces[0].ar_model = quiet, regimes.quiet_variance_ratio * leaves
         spaces[1].ar_model = slug, variance * leaves
         self.filters = [Filter(space) for space in spaces]
-        """in quiet, in a slug"""
+        """filters of the regimes: quiet, slug"""
         covariance = np.kron(regimes.variance * before, np.diag(leaves))
         covariance += np.kron(np.ones((W, W)), np.diag(stays))
         for each in self.filters:
@@ -84,7 +84,7 @@ class SwitchingInflowFilter:
         self._innovation: tuple[np.ndarray, np.ndarray] | tuple[None, None] = (None, None)
 
     def predict(self) -> None:
-        """Advance one time step: either regime may have come from both."""
+        """Mix the regimes, and advance one time step."""
         joint = self._transitions * self.probabilities[:, None]
         self.probabilities = joint.sum(axis=0)
         quiet, slug = self.filters
@@ -100,7 +100,7 @@ class SwitchingInflowFilter:
     def assimilate(self, voltages: np.ndarray, currents: np.ndarray) -> None:
         """Predict, and condition on voltages (L,) in V for an injection (L,) in A.
 
-        They are linearised once, about the mean of both regimes.
+        The voltages are linearised once, about the mean of both regimes.
         """
         self.predict()
         mean = self.probabilities @ [each.concentration for each in self.filters]
@@ -132,11 +132,11 @@ class SwitchingInflowFilter:
 
 
 class ParticleInflowFilter(SwitchingInflowFilter):
-    """Rao–Blackwellised particle filter of the same two regimes: a particle is a sequence of them.
+    """Rao–Blackwellised particle filter of the two regimes; a particle is a regime sequence.
 
-    Each particle has a Kalman filter, linearised about its own prediction, and branches into both
-    regimes; before that they are resampled. With at most ``particles`` sequences the result is
-    exact but for the linearisation.
+    Each particle has a Kalman filter, linearised about its own prediction. At each step the
+    particles are resampled and branch into both regimes. With at most ``particles`` sequences the
+    result is exact except for the linearisation.
 
     Parameters
     ----------
@@ -158,9 +158,9 @@ class ParticleInflowFilter(SwitchingInflowFilter):
         kept, weights = resample(self.probabilities, self.particles, self._random)
         self.probabilities = (weights[:, None] * self._transitions[kept % 2]).ravel()
         self.filters = [copy(self.filters[k]) for k in kept for _ in range(2)]
-        for each, space in zip(self.filters, cycle(self._spaces)):  # in quiet, in a slug, in turn
+        for each, space in zip(self.filters, cycle(self._spaces)):  # quiet and slug, alternating
             each.space = space
-            each.covariance = copy(each.covariance)  # a step of the window writes a new array
+            each.covariance = copy(each.covariance)  # shallow: `shift` allocates a new array
             each.predict()
 
     def assimilate(self, voltages: np.ndarray, currents: np.ndarray) -> None:
@@ -183,8 +183,8 @@ def resample(probabilities: np.ndarray, count: int,
              random: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     """Return indices and new probabilities of at most ``count`` particles, without bias.
 
-    Those above a threshold stay as they are; of the others some are drawn systematically and get
-    the threshold as probability (Fearnhead & Clifford, J. R. Stat. Soc. B 65, 2003).
+    Particles above a threshold are kept; some of the others are drawn systematically and get the
+    threshold as probability (Fearnhead & Clifford, J. R. Stat. Soc. B 65, 2003).
     """
     if len(probabilities) <= count:
         return np.arange(len(probabilities)), probabilities

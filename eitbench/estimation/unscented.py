@@ -1,4 +1,4 @@
-"""Unscented Kalman filter: sigma points in place of derivatives (docs/methods.md, 16)."""
+"""Unscented Kalman filter: sigma points instead of derivatives (docs/methods.md, 16)."""
 
 from __future__ import annotations
 
@@ -15,27 +15,27 @@ if TYPE_CHECKING:
     from eitbench.physics.observation import VoltageNoise
 
 SPREAD = 3.0**0.5
-"""Standard deviations between the mean and a sigma point: Gauss–Hermite's, for a Gaussian."""
+"""Distance of a sigma point from the mean in standard deviations (Gauss–Hermite nodes)."""
 
 
 class UnscentedFilter(Filter):
-    """Kalman filter that takes moments of voltages and concentration from sigma points.
+    """Kalman filter with moments of voltages and concentration from sigma points.
 
-    The points lie on the principal axes of the predicted concentration, `SPREAD` standard
-    deviations from its mean on both sides. Means are those of the unscented transform (Julier &
-    Uhlmann 1997) with κ = 3 − k, covariances those of central differences, which have no negative
-    eigenvalue (Nørgaard, Poulsen & Ravn, Automatica 36, 2000).
+    The points are on the principal axes of the predicted concentration, `SPREAD` standard
+    deviations from its mean on both sides. Means follow the unscented transform (Julier & Uhlmann
+    1997) with κ = 3 − k, covariances central differences, which have no negative eigenvalue
+    (Nørgaard, Poulsen & Ravn, Automatica 36, 2000).
 
     Parameters
     ----------
     space : StateSpace
-        Its `concentration` accepts several states at once.
+        State space with a `concentration` that accepts several states at once.
     resistance : callable
         Concentrations (N, n) in mol/m³ -> transfer resistances (N, L, L) in Ω (Ω·m in 2D).
     basis : (n, q)
-        Orthonormal columns that contain the deviations of the concentration.
+        Orthonormal columns that span the deviations of the concentration.
     axes : int
-        Largest number k of principal axes; the others count as certain for the voltages.
+        Largest number k of principal axes; voltages ignore the variance along the others.
     """
 
     def __init__(self, space: StateSpace, resistance: Callable[[np.ndarray], np.ndarray],
@@ -47,12 +47,12 @@ class UnscentedFilter(Filter):
         self.axes = axes
 
     def _sigma_points(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return concentrations (2 k + 1, n), the mean's first, and the derivatives (k, n_x) of
+        """Return concentrations (2 k + 1, n), at the mean first, and the derivatives (k, n_x) of
         the standardised coordinates along the axes by the state."""
         J = self.space.jacobian(self.mean, self.basis.T)
         cross = self.covariance.times(J.T)
         variances, axes = np.linalg.eigh(J @ cross[:J.shape[1]])
-        keep = variances[-self.axes:] > 1e-12 * variances[-1]             # the others are certain
+        keep = variances[-self.axes:] > 1e-12 * variances[-1]         # drop axes of zero variance
         scaled = axes[:, -self.axes:][:, keep] / np.sqrt(variances[-self.axes:][keep])
         offsets = SPREAD * (cross @ scaled).T
         states = self.mean + np.concatenate([np.zeros((1, len(self.mean))), offsets, -offsets])
@@ -73,9 +73,9 @@ class UnscentedFilter(Filter):
 
 def moments(values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return mean (m,) of a function of k independent standard normal numbers, its derivatives
-    (m, k), and a root (m, k) of the covariance that its curvature adds.
+    (m, k), and a root (m, k) of the covariance from its curvature.
 
-    ``values`` (2 k + 1, m) are those at zero, at `SPREAD` along each axis, and at its negative.
+    ``values`` (2 k + 1, m) are at zero, at `SPREAD` along each axis, and at −`SPREAD`.
     """
     middle, (more, less) = values[0], np.split(values[1:], 2)
     bend = (0.5 * (more + less) - middle).T / SPREAD**2

@@ -1,5 +1,4 @@
-"""Velocity unknown: a few parameters that walk at random, estimated with the concentration
-(thesis ch. 6)."""
+"""Unknown velocity: random-walk parameters, estimated with the concentration (thesis ch. 6)."""
 
 from __future__ import annotations
 
@@ -22,13 +21,13 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class VelocityPrior:
-    """v = Σ θ_k v_k, with θ a random walk that begins at N(θ_0, diag(std²)).
+    """Prior of the velocity v = Σ θ_k v_k, with θ a random walk from N(θ_0, diag(std²)).
 
-    ``ValueError`` naming what is of the wrong shape, or not positive for θ_0.
+    ``ValueError`` naming an argument of the wrong shape, or if v is not positive for θ_0.
     """
 
     transport_at: Callable[[np.ndarray], ConvectionDiffusion]
-    """θ (k,) -> the model with that velocity; all with one mesh and one inlet"""
+    """θ (k,) -> transport model with that velocity; all with the same mesh and inlet"""
     basis_fields: Sequence[VelocityField]
     """the k fields v_k"""
     initial: np.ndarray
@@ -36,13 +35,13 @@ class VelocityPrior:
     initial_std: np.ndarray
     """(k,)"""
     walk_std: np.ndarray
-    """(k,) of the steps of the walk, one a time step; zero for a constant velocity"""
+    """(k,) standard deviation of the walk per time step; zero for a constant velocity"""
     profiles: np.ndarray
-    """(p, k) axial velocity of each v_k at p points across the flow, off the walls"""
+    """(p, k) axial velocity of each v_k at p points across the flow, not on the walls"""
 
     bounds: tuple[float, float] = (0.05, 4.0)
-    """least and largest axial velocity at each point, relative to that of θ_0: points close to a
-    wall bind no more than others; 0 < least < 1 < largest"""
+    """least and largest axial velocity at each point, relative to the velocity for θ_0 there;
+    0 < least < 1 < largest"""
 
     def __post_init__(self) -> None:
         k = len(self.basis_fields)
@@ -73,13 +72,13 @@ class VelocityPrior:
 class VelocityStates(StateSpace):
     """Concentration and velocity parameters, c⁺ = F(θ) c + Y(θ) c_in + w, θ⁺ = θ + ω.
 
-    Each step is linearised at the present mean: the covariance of (c, θ) moves with [[F, ∂c⁺/∂θ],
-    [0, I]], where F, Y and the derivative are those of the discrete step at θ̂. The noise is Γ_w =
-    Y(θ̂) Γ_η Y(θ̂)ᵀ + H Γ_e Hᵀ, of which only the nodal part H Γ_e Hᵀ is frozen at the nominal
-    velocity: H would cost as much as F, and the part is small.
+    Each step is linearised at the present mean: the covariance of (c, θ) is propagated with
+    [[F, ∂c⁺/∂θ], [0, I]], with F, Y and the derivative of the discrete step at θ̂. The noise is
+    Γ_w = Y(θ̂) Γ_η Y(θ̂)ᵀ + H Γ_e Hᵀ. The nodal part H Γ_e Hᵀ is small and computed only at the
+    nominal velocity, since H costs as much as F.
 
-    After each measurement θ is moved back within the flow's bounds; concentration and covariance
-    stay what they are. ``ValueError`` naming the argument if it is out of range, of the wrong
+    After each measurement vector θ is projected onto the flow's bounds; concentration and
+    covariance do not change. ``ValueError`` naming the argument if it is out of range, of the wrong
     shape, or not finite.
 
     Parameters
@@ -87,7 +86,7 @@ class VelocityStates(StateSpace):
     flow : VelocityPrior
         Prior of θ.
     mean, covariance : (n,), (n, n)
-        Of the concentration at t = 0, in mol/m³ and its square.
+        Mean and covariance of the concentration at t = 0, in mol/m³ and (mol/m³)².
     inflow, inflow_std : float
         c_in and the standard deviation of η in mol/m³; ĉ_bh and ĉ_bh/4 in the thesis.
     nodal_noise : (n, n)
@@ -121,7 +120,7 @@ class VelocityStates(StateSpace):
                                                          self.flow.basis_fields)
 
         def advance(X: np.ndarray) -> np.ndarray:
-            """[[F, ∂c⁺/∂θ], [0, I]] X; with its sparse matrices a step costs far less than F."""
+            """Return [[F, ∂c⁺/∂θ], [0, I]] X; a step with sparse matrices is cheaper than F X."""
             moved = transport.step(X[:n], X[inlet], 0.0)
             moved += by_theta @ X[n:]
             return np.concatenate([moved, X[n:]])
@@ -147,8 +146,8 @@ class VelocityStates(StateSpace):
 
 
 def velocity_states(task: Task, c_ref: float, bounds: tuple[float, float]) -> VelocityStates:
-    """Return concentration and velocity with the parameters of Table 5.1 and the task's prior of
-    the velocity."""
+    """Return the state space of concentration and velocity, with the parameters of Table 5.1 and
+    the task's prior of the velocity."""
     prior = task.prior
     nodal = task.evolution.state_noise_covariance(0.0, (prior.nodal_std * c_ref)**2)
     return VelocityStates(task_velocity_prior(task, bounds), np.full(task.mesh.n_nodes, c_ref),
@@ -157,17 +156,17 @@ def velocity_states(task: Task, c_ref: float, bounds: tuple[float, float]) -> Ve
 
 
 def task_velocity_prior(task: Task, bounds: tuple[float, float] = (0.05, 4.0)) -> VelocityPrior:
-    """Return the prior of the velocity that a task asks for; ``ValueError`` if it asks for none."""
+    """Return a task's prior of the velocity; ``ValueError`` if the velocity is not estimated."""
     flow = task.velocity
     if flow is None:
-        raise ValueError("task must ask for the flow, got one that does not")
+        raise ValueError("task must have an unknown velocity, got one with a specified velocity")
     return VelocityPrior(task.transport_at, flow.basis_fields, np.array(flow.nominal),
                        np.array(flow.initial_std), np.array(flow.walk_std), flow.profiles, bounds)
 
 
 def scaled_velocity_prior(task: Task, std: float, walk_std: float) -> VelocityPrior:
-    """Return the flow that a task specifies times a factor, which begins at 1 ± ``std`` and walks:
-    a prior for a nominal flow that may be wrong. ``ValueError`` if nothing flows."""
+    """Return a prior for an uncertain nominal flow: the task's velocity times a factor, a random
+    walk from 1 ± ``std``. ``ValueError`` if the task has no flow."""
     from eitbench.physics.transport import ConvectionDiffusion
     transport = task.transport
     if not isinstance(transport, ConvectionDiffusion):
@@ -178,4 +177,4 @@ def scaled_velocity_prior(task: Task, std: float, walk_std: float) -> VelocityPr
         return transport.with_velocity(lambda points: factor[0] * nominal(points))
 
     return VelocityPrior(transport_at, [nominal], np.ones(1), np.array([std]), np.array([walk_std]),
-                       np.ones((1, 1)))
+                         np.ones((1, 1)))

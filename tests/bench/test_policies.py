@@ -149,7 +149,7 @@ def test_the_action_of_a_pair_injects_it(name):
     expected[0, rules.pairs[21]] = rules.amplitude, -rules.amplitude
     np.testing.assert_allclose(rules.currents(np.array([action])), expected, rtol=1e-6)
     if rules.limit is None and rules.budget is None:
-        with pytest.raises(ValueError, match="pair must be a number: in a world without a budget each step injects"):
+        with pytest.raises(ValueError, match="pair must be a number in a world without a budget, got None"):
             rules.action(None)
     else:
         assert not rules.currents(np.array([rules.action(None)])).any()

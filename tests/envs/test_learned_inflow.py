@@ -195,8 +195,8 @@ def test_other_worlds_may_know_the_inflow_too(name):
 
 @pytest.mark.parametrize(("name", "inflow", "message"), [
     (INFLOW, "pink", "inflow must be one of white, learned, got 'pink'"),
-    (FLOW, "learned", "inflow must be 'white' where the flow is to be estimated too"),
-    (TANK, "learned", "inflow must be 'white' where nothing flows in"),
+    (FLOW, "learned", "inflow must be 'white' where the velocity is estimated too"),
+    (TANK, "learned", "inflow must be 'white' for a target without inflow"),
 ])
 def test_wrong_inflows_are_named(name, inflow, message):
     """Before anything is computed."""

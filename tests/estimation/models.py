@@ -1,4 +1,4 @@
-"""Small worlds for the estimators, and the textbook in plain dense matrices to compare them with."""
+"""Small models for tests of estimators, and textbook algorithms with dense matrices for comparison."""
 
 from functools import lru_cache
 from typing import NamedTuple
@@ -25,7 +25,7 @@ from tiny_worlds import TINY
 
 
 class LinearGaussian(NamedTuple):
-    """c⁺ = F c + s + w with w ~ N(0, Q), from c₀ ~ N(mean, covariance)."""
+    """Model c⁺ = F c + s + w with w ~ N(0, Q), from c₀ ~ N(mean, covariance)."""
 
     F: np.ndarray
     s: np.ndarray
@@ -34,13 +34,13 @@ class LinearGaussian(NamedTuple):
     covariance: np.ndarray
 
     def filter(self):
-        """The package's filter of this model, its covariance Π − Z Zᵀ."""
+        """Return the package's filter of this model, with covariance Π − Z Zᵀ."""
         covariance = LowRankCovariance(OpenLoopCovariance(self.F, self.Q, self.covariance))
         return Filter(NodalStates(self.mean, covariance, Motion(self.F, self.s)))
 
 
 class Gaussian(NamedTuple):
-    """A mean and a full covariance."""
+    """Mean and full covariance."""
 
     mean: np.ndarray
     covariance: np.ndarray
@@ -51,7 +51,7 @@ class Gaussian(NamedTuple):
 
 
 def random_model(rng, n=14, radius=0.9):
-    """A stable model far from normal (‖F‖ ≈ 1.7, as in the pipe), with noise of less than full rank."""
+    """Return a stable non-normal model (‖F‖ ≈ 1.7, as in the pipe), with rank-deficient noise."""
     F = rng.normal(size=(n, n))
     F *= radius / np.abs(np.linalg.eigvals(F)).max()
     gain = rng.normal(size=(n, n // 2))
@@ -61,15 +61,15 @@ def random_model(rng, n=14, radius=0.9):
 
 
 def random_design(rng, n, steps, m=3, noise=(50.0, 500.0)):
-    """Another observation matrix (m, n) and other noise variances (m,) at each step.
+    """Return an observation matrix (m, n) and noise variances (m,) for each step.
 
-    By default the noise is about as large as what the state adds to a measurement, so that both count.
+    By default the noise is about as large as the contribution of the state.
     """
     return [(rng.normal(size=(m, n)), rng.uniform(*noise, m)) for _ in range(steps)]
 
 
 def draw(model, design, rng):
-    """One truth (T + 1, n) of the model, t = 0 first, and its observations t = 1 … T."""
+    """Sample a truth (T + 1, n) of the model, t = 0 first, and its measurements t = 1 … T."""
     c = rng.multivariate_normal(model.mean, model.covariance)
     truth, observations = [c], []
     for H, variance in design:
@@ -81,7 +81,7 @@ def draw(model, design, rng):
 
 
 def dense_filter(model, observations):
-    """The Kalman recursion with n×n covariances: [(predicted, filtered)] for t = 1 … T."""
+    """Run the Kalman recursion with n×n covariances: [(predicted, filtered)] for t = 1 … T."""
     now, steps = Gaussian(model.mean, model.covariance), []
     for H, value, variance, _ in observations:
         predicted = Gaussian(model.F @ now.mean + model.s, model.F @ now.covariance @ model.F.T + model.Q)
@@ -93,7 +93,7 @@ def dense_filter(model, observations):
 
 
 def rauch_tung_striebel(model, steps):
-    """The smoother that comes back over `dense_filter` with an n×n inverse a step: [smoothed] for t = 1 … T."""
+    """Run the backward pass over `dense_filter` with an n×n inverse per step: [smoothed] for t = 1 … T."""
     smoothed = [steps[-1][1]]
     for (_, filtered), (predicted, _) in zip(steps[-2::-1], steps[:0:-1], strict=True):
         G = np.linalg.solve(predicted.covariance, model.F @ filtered.covariance).T
@@ -104,12 +104,12 @@ def rauch_tung_striebel(model, steps):
 
 
 def stacked(models, observations):
-    """States x₁ … x_T given all measurements, [Gaussian], from their joint Gaussian without any recursion.
+    """Return the states x₁ … x_T given all measurements, [Gaussian], from their joint Gaussian without recursion.
 
-    ``models`` are of the step to each t, the first with the state at t = 0.
+    ``models`` are for the step to each t; the first also holds the state at t = 0.
     """
     n, T = len(models[0].mean), len(observations)
-    # x = A (offset + w): A holds products of transitions and w the independent noises, x₀ being the first.
+    # x = A (offset + w): A holds products of transitions, and w the independent noises, with x₀ first.
     back = np.zeros(((T + 1) * n, (T + 1) * n))
     noise = np.zeros_like(back)
     noise[:n, :n] = models[0].covariance
@@ -132,9 +132,9 @@ def stacked(models, observations):
 
 @lru_cache(maxsize=1)
 def pipe(steps=5):
-    """The thesis' pipe with n = 1701: its model in full matrices, a maker of its filter, observations, `dense_filter`.
+    """Return the thesis' pipe with n = 1701: dense model, factory of its filter, measurements, `dense_filter`.
 
-    The full matrices are put together from Table 5.1 here, the filter by ``table_5_1_filter``.
+    The dense matrices are assembled from Table 5.1 here, the filter by ``table_5_1_filter``.
     """
     c_bh = 30.0
     rng = np.random.default_rng(11)
@@ -161,7 +161,7 @@ def pipe(steps=5):
 
 
 class QuadraticModel:
-    """R(c) I = Σ_j c_j² T_j I with symmetric T_j: a stand-in for ``ObservationModel``, linear in the currents I."""
+    """Substitute for ``ObservationModel``, linear in the currents I: R(c) I = Σ_j c_j² T_j I with symmetric T_j."""
 
     def __init__(self, rng, n=6, electrodes=4):
         T = rng.normal(size=(n, electrodes, electrodes))
@@ -178,19 +178,19 @@ class QuadraticModel:
 
 @lru_cache(maxsize=1)
 def tiny_task():
-    """The task of the tiny world."""
+    """Return the task of the tiny world."""
     return make_task(TINY)
 
 
 def white_inflow(task):
-    """The prior of Table 5.1: every node and every step is independent of all others."""
+    """Return the prior of Table 5.1: all nodes and steps are independent."""
     points = task.mesh.points[task.transport.inlet]
     return InflowPrior("linear", points, task.prior.inflow_std * np.eye(len(points)), np.ones(1),
                        task.transport.time_step)
 
 
 def two_modes(points, time_step=5e-3, link="logarithm", size=0.2, regimes=None):
-    """A prior of two modes across the inlet's nodes, correlated over four steps."""
+    """Return a prior of two modes across the inlet's nodes, correlated over four steps."""
     r = points[:, 1] / R
     return InflowPrior(link, points, size * np.stack([np.exp(-r**2), r], axis=1), 0.6**np.arange(5)**2.0, time_step,
                        regimes=regimes)
@@ -199,32 +199,32 @@ def two_modes(points, time_step=5e-3, link="logarithm", size=0.2, regimes=None):
 R = 0.05
 """Half the height of the pipe in m."""
 MESH = rectangle_mesh(np.linspace(0.0, 0.4, 21), np.linspace(-R, R, 7))
-"""A coarse pipe of 147 nodes."""
+"""Coarse pipe of 147 nodes."""
 PROFILES = [lambda eta: 1.5 * (1 - eta**2), lambda eta: 1.5 * eta * (1 - eta**2),
             lambda eta: 1.5 * (1 - eta**2) * (5 * eta**2 - 1)]
 HEIGHTS = np.linspace(-0.9, 0.9, 13)
 
 
 def directions(k):
-    """The fields of the first k profiles."""
+    """Return the fields of the first k profiles."""
     return [lambda points, profile=profile: np.column_stack([profile(points[:, 1] / R), np.zeros(len(points))])
             for profile in PROFILES[:k]]
 
 
 def shapes(k):
-    """(13, k) values of the first k profiles."""
+    """Return values (13, k) of the first k profiles."""
     return np.stack([profile(HEIGHTS) for profile in PROFILES[:k]], axis=1)
 
 
 def coarse_transport(theta, diffusivity):
-    """v = Σ θ_k v_k in the coarse pipe; fluid of mean speed 4.5 m/s passes it in 18 steps."""
+    """Return the transport with v = Σ θ_k v_k; at a mean velocity of 4.5 m/s the residence time is 18 steps."""
     fields = directions(len(theta))
     return ConvectionDiffusion(MESH, lambda points: sum(t * v(points) for t, v in zip(theta, fields, strict=True)),
                                diffusivity, 5e-3, substeps=4, inlet=np.arange(7))
 
 
 def averages(mesh, random, m):
-    """(m, n) averages about m random places, a little wider than a cell."""
+    """Return averages (m, n) about m random points, slightly wider than a cell."""
     places = random.uniform([0.0, -R], [0.4, R], (m, 2))
     weights = np.exp(-0.5 * (((mesh.points - places[:, None]) / [0.02, 0.015])**2).sum(axis=2))
     return weights / weights.sum(axis=1, keepdims=True)

@@ -1,4 +1,4 @@
-"""Every state space and covariance form against one Gaussian of all states, conditioned at once on all measurements."""
+"""All state spaces and covariance forms agree with the joint Gaussian of all states given all measurements."""
 
 from dataclasses import replace
 
@@ -49,7 +49,7 @@ THETA = np.array([4.0, 0.5])
 
 
 def nodal(covariance, motions):
-    """A filter of `NodalStates` whose motions are those of models."""
+    """Return a filter of `NodalStates` with the motions of ``models``."""
     def motion(time):
         model = motions[time - 1]
         return Motion(model.F, model.s, model.Q)
@@ -72,7 +72,7 @@ def dense_changing():
 
 
 def dense_by_columns():
-    """F as a callable."""
+    """Return a filter with F as a callable."""
     filter_, models = dense_changing()
     motion = filter_.space.motion
     space = NodalStates(models[0].mean, DenseCovariance(models[0].covariance),
@@ -87,7 +87,7 @@ def at_rest():
 
 
 def modal():
-    """Weights and their rates of change."""
+    """Return a filter of mode weights and their rates of change."""
     A, Q = matern32_transition(0.3)
     model = LinearGaussian(np.kron(A, np.eye(5)), np.zeros(10), 0.49 * np.kron(Q, np.eye(5)), np.zeros(10),
                            0.49 * np.eye(10))
@@ -99,7 +99,7 @@ def coarse_task():
 
 
 def window_model(weights, variances, before):
-    """A window of values, the newest first, as a linear model."""
+    """Return a window of values, the newest first, as a linear model."""
     W, d = weights.shape
     F, Q = np.eye(W * d, k=-d), np.zeros((W * d, W * d))
     F[:d] = np.concatenate([np.diag(row) for row in weights], axis=1)
@@ -121,7 +121,7 @@ def known_flow(k=2):
 
 
 def velocity():
-    """With θ known; the state ends with θ."""
+    """Return a filter with known θ; the state ends with θ."""
     F, Y = coarse_transport(THETA, 1e-2).transition()
     n, root = len(F), np.random.default_rng(0).normal(size=(len(F), 20))
     nodal_noise, P = 0.01 * root @ root.T, 50.0 * np.eye(n)
@@ -139,7 +139,7 @@ nodal_forms = pytest.mark.parametrize("form", [low_rank, dense, dense_changing, 
 
 
 def measured(filter_, models, m=3, noise=(0.1, 1.0), root=False):
-    """Observations of the concentration, and the same of the state."""
+    """Return measurements of the concentration, and the same measurements of the state."""
     rng = np.random.default_rng(7)
     space, mean = filter_.space, filter_.mean
     n = len(filter_.concentration)
@@ -161,7 +161,7 @@ def assert_close(ours, theirs, tolerance=1e-9):
 
 
 def assert_state(filter_, expected, tolerance=1e-9):
-    """Mean and variances of the whole state."""
+    """Compare mean and variances of the full state."""
     assert_close(filter_.mean, expected.mean, tolerance)
     assert_close(filter_.covariance.diagonal(), expected.variance, tolerance)
 
@@ -176,7 +176,7 @@ def run(filter_, observations):
 @every
 @pytest.mark.parametrize("root", [False, True], ids=["independent", "correlated"])
 def test_filter_is_conditioning(form, root):
-    """Mean and variances after the first, the third and the last measurement, and the innovations."""
+    """Mean and variances after the first, third and last measurement vector, and the innovations, are exact."""
     filter_, models = form()
     seen, of_state = measured(filter_, models, root=root)
     for t, observation in enumerate(seen, start=1):
@@ -196,8 +196,8 @@ def test_filter_is_conditioning(form, root):
 
 
 @every
-def test_missing_readings_are_fewer_readings(form):
-    """NaN in place of a reading, and a reading beyond the gate, are as if they had not been measured."""
+def test_missing_measurements_are_ignored(form):
+    """NaN measurements and measurements beyond the gate have no effect."""
     lost, _ = form()
     fewer, models = form()
     seen, _ = measured(lost, models, m=4)
@@ -217,7 +217,7 @@ def test_missing_readings_are_fewer_readings(form):
 
 @every
 def test_gate(form):
-    """A wide gate is none; a reading far off is rejected alone; where half of them are, all are."""
+    """A wide gate has no effect; one outlier is rejected alone; if half are outliers, all are rejected."""
     filters = [form()[0] for _ in range(3)]
     _, models = form()
     wide, plain, gated = filters
@@ -234,7 +234,7 @@ def test_gate(form):
 
 
 @every
-def test_iterating_changes_nothing_where_all_is_linear(form):
+def test_iteration_changes_nothing_for_linear_models(form):
     once, models = form()
     again, _ = form()
     seen, _ = measured(once, models)
@@ -257,7 +257,7 @@ def test_smoothed_means(form):
 
 
 def test_fixed_interval_and_fixed_lag_smoother():
-    """With variances: all states given all measurements, and each given those of the next few."""
+    """Smoothed means and variances are exact given all measurements, and given the next few measurements."""
     filter_, models = low_rank()
     seen, of_state = measured(filter_, models)
     for ours, theirs in zip(fixed_interval_smoother(filter_, seen), stacked(models, of_state), strict=True):
@@ -273,7 +273,7 @@ def test_fixed_interval_and_fixed_lag_smoother():
 
 
 def test_a_window_is_its_own_smoother():
-    """`estimate` with a lag: the states t = 1 … T given all measurements, from the window's Gaussian."""
+    """`estimate` with a lag returns the states t = 1 … T given all measurements."""
     filter_, models = inflow_window()
     seen, of_state = measured(filter_, models)
     posterior = stacked(models, of_state)[-1]
@@ -289,7 +289,7 @@ def test_a_window_is_its_own_smoother():
 
 
 def test_windows_with_a_known_velocity_are_the_inflow_window():
-    """Where the other one drops next to nothing: to 1e-3 of the deviation, which it has forgotten."""
+    """The difference is at most 1e-3 of the deviation, the truncated part of the response."""
     task, prior = coarse_task(), two_modes(MESH.points[:7], link="linear")
     other = Filter(InflowWindow(task, prior, LEVEL))
     filter_ = Filter(VelocityInflowWindow(task, prior, LEVEL, known_flow(), other.space.window_steps))
@@ -303,8 +303,8 @@ def test_windows_with_a_known_velocity_are_the_inflow_window():
     assert not variance.any()
 
 
-def test_logarithms_are_linearised_where_they_are():
-    """Derivatives of c = ĉ exp(E x) by differences, and variances by them."""
+def test_derivatives_of_log_states():
+    """Derivatives of c = ĉ exp(E x) agree with finite differences, and variances with the derivatives."""
     rng = np.random.default_rng(1)
     modes = 0.3 * rng.normal(size=(8, 5))
     for E, size in ((None, 8), (modes, 10)):
@@ -321,7 +321,7 @@ def test_logarithms_are_linearised_where_they_are():
 
 
 def test_the_pipe_of_the_thesis():
-    """n = 1701, five injections, the parameters of Table 5.1: filter and smoother with full matrices."""
+    """n = 1701, five injections, Table 5.1: filter and smoother agree with dense matrices."""
     model, make_filter, observations, exact = pipe()
     for step, (predicted, filtered) in zip(kalman_filter(make_filter(), observations), exact, strict=True):
         assert_close(step.predicted_mean, predicted.mean)
@@ -334,7 +334,7 @@ def test_the_pipe_of_the_thesis():
 
 
 def test_several_blocks_of_a_dense_covariance():
-    """n = 300 and 530, where triangles are mirrored in blocks: symmetric to the bit, and the dense recursion's."""
+    """For n = 300 and 530 (several blocks) the covariance is exactly symmetric and equals the dense recursion."""
     for n, steps in ((300, 3), (530, 2)):
         rng = np.random.default_rng(10)
         model = random_model(rng, n)

@@ -1,4 +1,4 @@
-"""Forms of the covariance: what they hold, and what they refuse; claims of the filter against chance."""
+"""Covariance forms: values and invalid arguments; consistency of the filter's reported uncertainty."""
 
 import numpy as np
 import pytest
@@ -31,7 +31,7 @@ def open_loop(model, **options):
 
 
 def recursion(model):
-    """Π_t by plain recursion."""
+    """Return Π_t by recursion."""
     covariance, result = model.covariance, {}
     for t in range(max(TIMES) + 1):
         result[t] = covariance
@@ -40,7 +40,7 @@ def recursion(model):
 
 
 def test_open_loop_covariance_is_the_dense_recursion(model):
-    """Π_t X and variances in any order; the limit solves the Lyapunov equation; a coarse tolerance loses that part."""
+    """Π_t X and variances are exact in any order; the limit solves the Lyapunov equation; a tolerance adds an error."""
     covariance, X = open_loop(model), np.random.default_rng(1).normal(size=(14, 4))
     coarse, off = open_loop(model, tolerance=1e-4), []
     for t, P in reversed(recursion(model)):
@@ -53,12 +53,12 @@ def test_open_loop_covariance_is_the_dense_recursion(model):
 
 
 @pytest.mark.parametrize("radius", [1.0, 1.02, 3.0])
-def test_a_state_that_never_settles_has_no_limit(radius):
+def test_unstable_models_have_no_limit(radius):
     with pytest.raises(ValueError, match="spectral radius below one"), np.errstate(over="ignore", invalid="ignore"):
         open_loop(random_model(np.random.default_rng(2), radius=radius))
 
 
-def test_a_target_at_rest_keeps_its_covariance(model):
+def test_stationary_target_keeps_its_covariance(model):
     """F = I without noise, the stationary target of thesis 7.2."""
     at_rest = OpenLoopCovariance(np.eye(14), np.zeros((14, 14)), model.covariance)
     for t in (0, 1, 9):
@@ -66,8 +66,8 @@ def test_a_target_at_rest_keeps_its_covariance(model):
                                    atol=1e-12 * np.abs(model.covariance).max())
 
 
-def test_arguments_stay_as_they_are(model):
-    """The covariance is written in place, but in its own array; F in any memory layout."""
+def test_arguments_are_not_modified(model):
+    """The covariance is updated in place in a separate array; F may have any memory layout."""
     kept = [array.copy() for array in model]
     for F in (model.F, np.asfortranarray(model.F), np.repeat(model.F, 2, axis=1)[:, ::2]):
         covariance = DenseCovariance(model.covariance).propagate(F, model.Q)
@@ -77,7 +77,7 @@ def test_arguments_stay_as_they_are(model):
 
 
 def test_variances_are_never_negative():
-    """Each state measured so precisely that only rounding is left of its variance: not below zero."""
+    """Variances are non-negative after measurements so precise that the result is pure rounding."""
     n = 30
     root = np.random.default_rng(9).normal(size=(n, n))
     covariance = DenseCovariance(1e6 * (root @ root.T + np.eye(n)))
@@ -93,10 +93,10 @@ def test_errors_name_the_argument(covariance):
 
 
 def twin(noise_factor):
-    """NIS and projected NEES, each over its degrees of freedom, of 100 episodes drawn from the model itself.
+    """Return NIS and projected NEES, each with its degrees of freedom, of 100 episodes sampled from the model.
 
-    ``noise_factor`` multiplies the noise variances that the filter assumes. The error at the end is projected on
-    the first three measured directions: (Aᵀe)ᵀ (AᵀPA)⁻¹ (Aᵀe), which is χ² with three degrees of freedom.
+    ``noise_factor`` multiplies the noise variances that the filter assumes. The final error is projected on
+    the last three measured directions: (Aᵀe)ᵀ (AᵀPA)⁻¹ (Aᵀe), which is χ² with three degrees of freedom.
     """
     rng = np.random.default_rng(2025)
     n, m, T, episodes = 14, 3, 30, 100
@@ -117,13 +117,13 @@ def twin(noise_factor):
 
 
 def within_band(mean, freedoms):
-    """Whether a χ²-sum over its degrees of freedom lies within its central 99 %."""
+    """Return whether a χ²-sum over its degrees of freedom is within its central 99 %."""
     low, high = chi2.ppf([0.005, 0.995], freedoms) / freedoms
     return low < mean < high
 
 
 def test_filter_is_consistent_on_its_own_model():
-    """Innovations and errors are as large as the filter predicts; with half the noise they are not, and it shows."""
+    """Innovations and errors match the filter's covariances, and do not if the filter assumes half the noise."""
     assert all(within_band(*each) for each in twin(noise_factor=1.0))
     nis, nees = twin(noise_factor=0.5)
     assert not within_band(*nis) and not within_band(*nees)
@@ -131,7 +131,7 @@ def test_filter_is_consistent_on_its_own_model():
 
 
 def test_linearised_observation_is_the_tangent():
-    """V − R(c*) + J c* = J c + v: near c* the misfit of the tangent is of second order."""
+    """V − R(c*) + J c* = J c + v: close to c* the linearisation error is of second order."""
     rng = np.random.default_rng(8)
     model, point, current = QuadraticModel(rng), rng.uniform(1.0, 2.0, 6), rng.normal(size=4)
     voltages = rng.normal(size=4)

@@ -1,4 +1,4 @@
-"""What an injection teaches, for all pairs at once, against the textbook's update for each."""
+"""Design criteria of all pairs at once agree with the textbook update for each pair."""
 
 import numpy as np
 import pytest
@@ -12,7 +12,7 @@ PAIRS = electrode_pairs(L)
 
 
 def a_state(seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Derivatives of 𝓡 (L, L, n), covariance, weight of the errors, noise variances (pairs, L); all at random."""
+    """Return random derivatives of 𝓡 (L, L, n), covariance, error weight and noise variances (pairs, L)."""
     rng = np.random.default_rng(seed)
     roots = rng.normal(size=(2, N, N))
     covariance, weight = roots @ roots.swapaxes(1, 2)
@@ -26,15 +26,15 @@ def gains_of(derivative, covariance, weight, noise_variance):
 
 
 def textbook(matrix: np.ndarray, covariance: np.ndarray, noise_variance: np.ndarray) -> np.ndarray:
-    """P − P Hᵀ (H P Hᵀ + R)⁻¹ H P."""
+    """Return P − P Hᵀ (H P Hᵀ + R)⁻¹ H P."""
     S = matrix @ covariance @ matrix.T + np.diag(noise_variance)
     return covariance - covariance @ matrix.T @ np.linalg.inv(S) @ matrix @ covariance
 
 
 @settings(max_examples=20)
 @given(st.integers(0, 2**32 - 1))
-def test_gains_are_what_the_update_takes_away(seed):
-    """Of every pair: tr(W P) before less after, and half the logarithm of det P before over after."""
+def test_criteria_are_the_reductions_by_the_update(seed):
+    """The criteria of each pair are the reductions of tr(W P) and of ½ ln det P."""
     derivative, covariance, weight, noise_variance = a_state(seed)
     traces, bits = gains_of(derivative, covariance, weight, noise_variance)
     for k, (i, j) in enumerate(PAIRS):
@@ -44,8 +44,8 @@ def test_gains_are_what_the_update_takes_away(seed):
         assert bits[k] == pytest.approx(0.5 * ratio, rel=1e-5, abs=1e-6)
 
 
-def test_endless_noise_is_no_reading():
-    """Readings that will not be believed teach as much as readings that are not there."""
+def test_infinite_noise_equals_a_missing_measurement():
+    """Measurements with infinite noise variance have no effect on the criteria."""
     derivative, covariance, weight, noise_variance = a_state(0)
     noise_variance[:, 2] = np.inf
     traces, bits = gains_of(derivative, covariance, weight, noise_variance)

@@ -1,4 +1,4 @@
-"""A filter with few modes and quadratic voltages: each part against what it stands for, in 3D too."""
+"""Reduced response and quadratic voltages of the fast inflow filter agree with the exact ones, also in 3D."""
 
 from functools import lru_cache
 
@@ -21,13 +21,13 @@ WORLDS = {"2D": PIPE_2D, "3D": PIPE_3D}
 
 @lru_cache(maxsize=2)
 def parts(name):
-    """Task, prior of the inflow's logarithm, and what an inflow leaves in the pipe."""
+    """Return the task, the prior of the inflow's logarithm, and the impulse response."""
     task = make_task(WORLDS[name])
     return task, compatible_priors(baseline_folder() / "priors", task, "logarithm")[0], steady_response(task.transport)
 
 
 def states(response, prior, count=200, seed=0):
-    """(count, n) of inflows drawn from the prior."""
+    """Return states (count, n) for inflows sampled from the prior."""
     K = response.weights.shape[1]
     root = np.linalg.cholesky(toeplitz(prior.time_covariance(K)))
     x = root @ np.random.default_rng(seed).normal(size=(count, K, prior.modes.shape[1]))
@@ -35,9 +35,9 @@ def states(response, prior, count=200, seed=0):
 
 
 @pytest.mark.parametrize("name", ["2D", "3D"])
-def test_few_directions_hold_what_inflows_move(name):
-    """All directions give the same states; 160 leave a thousandth of their squares at most, fewer more, and no other
-    basis of as many leaves less."""
+def test_leading_directions_have_the_least_projection_error(name):
+    """All directions reproduce the states; the projection error of 160 is at most 1e-3 of their squares, larger for
+    fewer directions, and larger for other bases of the same size."""
     _, prior, response = parts(name)
     exact = states(response, prior)
     whole = reduced_response(response, prior, 10**6)
@@ -51,14 +51,14 @@ def test_few_directions_hold_what_inflows_move(name):
 
 @lru_cache(maxsize=1)
 def fast():
-    """Scaled quadratic voltages of the 2D pipe, and the 48 directions in which they are quadratic."""
+    """Return the scaled quadratic voltages of the 2D pipe, and their 48 quadratic directions."""
     task, prior, response = parts("2D")
     basis = reduced_response(response, prior, 48).basis
     return task, basis, ScaledVoltageModel(task.observation, task.expected_concentration, basis)
 
 
-def test_level_costs_nothing():
-    """Homogeneous fluid of any level has its voltages to a thousandth, where a quadratic about a level is far off."""
+def test_voltages_are_exact_at_any_c_ref():
+    """Voltages of homogeneous fluid are exact to 1e-3 for any c_ref, unlike a quadratic model about a fixed c_ref."""
     task, basis, scaled = fast()
     plain = QuadraticVoltageModel(task.observation, task.expected_concentration, basis)
     off = {"scaled": [], "plain": []}
@@ -71,8 +71,8 @@ def test_level_costs_nothing():
     assert min(off["plain"]) > 10 * max(off["scaled"])
 
 
-def test_slopes_are_those_of_the_voltages():
-    """Finite differences, along and across its directions."""
+def test_derivatives_of_scaled_voltages():
+    """Derivatives agree with finite differences, inside and outside the span of the directions."""
     task, basis, scaled = fast()
     random = np.random.default_rng(0)
     c = task.expected_concentration * np.exp(basis @ random.normal(size=48) * 0.3 / np.linalg.norm(basis, axis=1).max())
@@ -84,7 +84,7 @@ def test_slopes_are_those_of_the_voltages():
 
 
 def test_every_pair_of_electrodes_is_contracted_once(monkeypatch):
-    """An agent that injects all 120 pairs in turn finds each again."""
+    """Contractions of all 120 pairs are computed once and stay in the cache."""
     calls = []
     real = QuadraticVoltageModel._contracted
     monkeypatch.setattr(QuadraticVoltageModel, "_contracted",
@@ -99,8 +99,8 @@ def test_every_pair_of_electrodes_is_contracted_once(monkeypatch):
     assert len(pairs) == len(calls) == 120
 
 
-def test_slugs_have_their_voltages():
-    """Of slugs as the prior draws them, to half the noise, root mean square."""
+def test_voltages_of_slugs():
+    """For slugs sampled from the prior the error of the voltages is at most half the noise, root mean square."""
     task, _, scaled = fast()
     _, prior, response = parts("2D")
     off = []

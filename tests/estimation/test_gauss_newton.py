@@ -1,4 +1,4 @@
-"""Gauss–Newton and the best homogeneous estimate against closed forms and scipy's minimisers."""
+"""Gauss–Newton and the best homogeneous estimate agree with closed forms and scipy's minimisers."""
 
 import numpy as np
 import pytest
@@ -14,7 +14,7 @@ from shapes import RootLaw
 
 
 class Linear:
-    """R(c) = J c for any injections."""
+    """Model R(c) = J c for any injections."""
 
     def __init__(self, jacobian):
         self.jacobian = jacobian
@@ -27,7 +27,7 @@ class Linear:
 
 
 class Arctangent:
-    """R(c) = arctan c for one number: from c = 3 a full Gauss–Newton step overshoots, and the next one more."""
+    """Model R(c) = arctan c for one number: from c = 3 full Gauss–Newton steps diverge."""
 
     def voltages(self, concentration, _currents):
         return np.arctan(concentration)[None]
@@ -37,7 +37,7 @@ class Arctangent:
 
 
 def small_tank():
-    """A real observation model with four electrodes, 45 nodes and a nonlinear conductivity."""
+    """Return an observation model with four electrodes, 45 nodes and a nonlinear conductivity."""
     eit = rectangle_mesh(np.linspace(0.0, 0.2, 9), np.linspace(-0.05, 0.05, 5))
     electrodes = [eit.facets_where(lambda p, a=a, y=y: (p[:, 1] == y) & (np.abs(p[:, 0] - a) < 0.026))
                   for y in (-0.05, 0.05) for a in (0.05, 0.15)]
@@ -48,7 +48,7 @@ def small_tank():
 
 @pytest.mark.parametrize("kind", [np.asarray, sp.csr_array], ids=["dense", "sparse"])
 def test_linear_model_gives_tikhonovs_solution(kind):
-    """(JᵀWJ + P)⁻¹JᵀWV, from far away and for either kind of penalty matrix, to 1e-8."""
+    """The result is (JᵀWJ + P)⁻¹JᵀWV to 1e-8, from a distant start, for sparse and dense penalties."""
     rng = np.random.default_rng(0)
     jacobian, voltages = rng.normal(size=(5, 4, 12)), rng.normal(size=(5, 4))
     std, root = rng.uniform(0.1, 2.0, (5, 4)), rng.normal(size=(12, 12))
@@ -60,7 +60,7 @@ def test_linear_model_gives_tikhonovs_solution(kind):
 
 
 def path_penalty(n, free=()):
-    """Σ (x_i − x_j)² along a path and a few chords, sparse; nodes ``free`` are in no term."""
+    """Return the sparse penalty Σ (x_i − x_j)² along a path and a few chords, without terms of the ``free`` nodes."""
     rng = np.random.default_rng(3)
     kept = np.setdiff1d(np.arange(n), free)
     edges = np.concatenate([np.stack([kept[:-1], kept[1:]], axis=1), rng.choice(kept, (n // 4, 2))])
@@ -73,7 +73,7 @@ def path_penalty(n, free=()):
 
 @pytest.mark.parametrize("free", [(), (5, 40)], ids=["constants", "two nodes more"])
 def test_few_readings_and_a_sparse_penalty_give_tikhonovs_solution(free, monkeypatch):
-    """60 nodes, 8 readings: with no full matrix factorised, unless more than constants are free."""
+    """For 60 nodes and 8 measurements no full matrix is factorised, unless the null space exceeds the constants."""
     if not free:
         monkeypatch.setitem(gauss_newton.__globals__, "cho_factor", None)
     rng, n = np.random.default_rng(4), 60
@@ -89,7 +89,7 @@ def test_few_readings_and_a_sparse_penalty_give_tikhonovs_solution(free, monkeyp
 
 
 def test_nonlinear_model_ends_where_the_gradient_vanishes():
-    """The objective's gradient, by central differences, is nothing beside the one at the start; scipy agrees."""
+    """The gradient of the objective, by central differences, is negligible at the result; scipy agrees."""
     rng = np.random.default_rng(1)
     model, currents, truth = QuadraticModel(rng), rng.normal(size=(3, 4)), rng.uniform(1.0, 2.0, 6)
     voltages = model.voltages(truth, currents) + 0.3 * rng.normal(size=(3, 4))
@@ -104,25 +104,25 @@ def test_nonlinear_model_ends_where_the_gradient_vanishes():
     found = gauss_newton(model, voltages, currents, std, penalty, start, tolerance=1e-14, max_iterations=100)
     assert np.abs(gradient(found)).max() < 1e-7 * np.abs(gradient(start)).max()
     assert objective(found) == pytest.approx(scipy.optimize.minimize(objective, truth, tol=1e-10).fun, rel=1e-8)
-    # The default tolerance stops earlier, but within that part of the minimum.
+    # The default tolerance stops earlier, but within the tolerance of the minimum.
     assert objective(gauss_newton(model, voltages, currents, std, penalty, start)) < 1.001 * objective(found)
 
 
 def test_steps_that_overshoot_are_halved():
-    """Newton on arctan from c = 3 diverges; with halving the minimum at zero is found."""
+    """Newton's method on arctan from c = 3 diverges; with step halving it converges to zero."""
     found = gauss_newton(Arctangent(), np.zeros((1, 1)), np.zeros((1, 1)), np.ones((1, 1)), np.zeros((1, 1)),
                          np.array([3.0]), tolerance=1e-12)
     assert abs(found[0]) < 1e-6
 
 
 def quadratic():
-    """Six states seen through a quadratic model."""
+    """Return a quadratic model of six states."""
     return 6, QuadraticModel(np.random.default_rng(2))
 
 
 @pytest.mark.parametrize("make", [quadratic, small_tank])
 def test_constant_is_recovered_from_clean_voltages(make):
-    """V = R(30·1), from a third and from three times of it, to 1e-7; injections may repeat."""
+    """V = R(30·1) yields 30 to 1e-7, from a third and from three times the value; injections may repeat."""
     n, model = make()
     currents = np.array([[1.0, -1.0, 0.0, 0.0], [0.0, 1.0, 0.0, -1.0], [1.0, -1.0, 0.0, 0.0], [0.0, 0.0, 1.0, -1.0]])
     voltages = model.voltages(np.full(n, 30.0), currents)
@@ -132,7 +132,7 @@ def test_constant_is_recovered_from_clean_voltages(make):
 
 @pytest.mark.parametrize("make", [quadratic, small_tank])
 def test_noisy_voltages_give_the_weighted_least_squares_minimum(make):
-    """Where scipy finds the minimum of Σ((V − R(c·1))/std)² over one number; the target is not homogeneous."""
+    """The result is scipy's minimum of Σ((V − R(c·1))/std)² over one number; the target is not homogeneous."""
     n, model = make()
     rng, noise = np.random.default_rng(3), VoltageNoise(0.05, 0.01)
     currents = np.array([[1.0, -1.0, 0.0, 0.0], [0.0, 1.0, 0.0, -1.0], [1.0, 0.0, -1.0, 0.0], [1.0, -1.0, 0.0, 0.0]])
@@ -149,10 +149,10 @@ def test_noisy_voltages_give_the_weighted_least_squares_minimum(make):
     assert np.log(found) == pytest.approx(expected.x, abs=1e-6)
 
 
-def test_not_settling_is_an_error():
-    """One iteration from far away is not enough, and the error says how far it got."""
+def test_missing_convergence_is_an_error():
+    """One iteration from a distant start raises an error with the last change and value."""
     n, model = quadratic()
     currents = np.array([[1.0, -1.0, 0.0, 0.0]])
     voltages = model.voltages(np.full(n, 30.0), currents)
-    with pytest.raises(RuntimeError, match=r"did not settle in 1 iterations; last change .* mol/m³"):
+    with pytest.raises(RuntimeError, match=r"did not converge in 1 iterations; last change .* mol/m³"):
         best_homogeneous(model, VoltageNoise(), n, voltages, currents, 10.0, max_iterations=1)

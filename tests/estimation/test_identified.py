@@ -1,5 +1,5 @@
-"""A model that training episodes have shown: against episodes it never saw, against one Gaussian conditioned at once,
-and against the density that it stands for."""
+"""Identified models are compared with unseen episodes, a joint Gaussian given all measurements, and the posterior
+density."""
 
 import copy
 from dataclasses import replace
@@ -48,7 +48,7 @@ def prior():
 
 
 def made(response, seed):
-    """States of an episode (T, n) in parts of the background, less 1, as a response makes them of its inflows."""
+    """Return the states (T, n) of an episode, relative to the background, less 1, from a response to its inflows."""
     s = TINY.sample_inflow(seed) / TINY.background - 1.0
     K = response.weights.shape[1]
     s = np.concatenate([np.zeros((K, s.shape[1])), s])
@@ -57,8 +57,8 @@ def made(response, seed):
     return np.array([response.basis @ np.tensordot(response.weights, each, 2) for each in past])
 
 
-def test_makes_states_of_episodes_that_it_never_saw():
-    """Its mean square error there is about what it says, and a tenth at most of that of a flow a fifth too slow."""
+def test_predicts_states_of_unseen_episodes():
+    """The mean square error matches the covariance, and is at most a tenth of the error with a too low velocity."""
     mass = examples("train:0").mass
     slow = steady_response(make_task(TINY, mean_velocity=36.0).transport)
     off, told = [], []
@@ -72,10 +72,9 @@ def test_makes_states_of_episodes_that_it_never_saw():
     assert 0.5 < np.mean(off) / model().residual_covariance.trace() < 6.0
 
 
-def test_corrects_the_flow_as_told_from_few_episodes():
-    """On episodes that it never saw its mean square error is below that of the flow as told, whose mesh is coarse, from
-    eight on, where a model that begins from nothing is far worse; from 24 on it is below six tenths, and about what it
-    says."""
+def test_residual_fit_needs_few_episodes():
+    """The residual fit to eight episodes has a smaller error on unseen episodes than the task's flow, and a much
+    smaller error than a full fit; with 24 episodes it is below six tenths, and matches its covariance."""
     mass = examples("train:0").mass
     corrected = identify_model(examples("train:0-23"), modes=24, residual_only=True)
     responses = {"told": steady_response(task().transport), "corrected by 24": corrected.response}
@@ -93,8 +92,8 @@ def test_corrects_the_flow_as_told_from_few_episodes():
     assert 0.5 < off["corrected by 24"] / corrected.residual_covariance.trace() < 6.0
 
 
-def test_mean_error_is_that_of_the_readings():
-    """What readings that it never saw exceed the model's by has no mean left, within its statistical error."""
+def test_mean_voltage_error():
+    """On unseen episodes the corrected voltage errors have zero mean, within the statistical error."""
     left = []
     for seed in parse_seeds("train:40-47"):
         (example,) = Dataset("tiny", TINY, (seed,))
@@ -111,13 +110,13 @@ def test_mean_error_is_that_of_the_readings():
 
 @lru_cache(maxsize=1)
 def once():
-    """The model whose voltages are linearised once."""
+    """Return the model with voltages linearised once."""
     return identify_model(examples("train:0-23"), modes=24, linearised=True)
 
 
-def test_scatter_is_that_of_linearised_readings():
-    """Readings of episodes that it never saw, less the voltages linearised about ĉ_bh at the true states, have no mean
-    left, and the covariance that it says: whitened, their mean square is 1 to a tenth. That of the noise is less."""
+def test_covariance_of_linearised_voltages():
+    """On unseen episodes, measured minus linearised voltages at the true states have zero mean and the model's
+    covariance: whitened, their mean square is 1 to a tenth. The noise alone is smaller."""
     whitened, in_noise = [], []
     for seed in parse_seeds("train:40-55"):
         (example,) = Dataset("tiny", TINY, (seed,))
@@ -137,9 +136,9 @@ def test_scatter_is_that_of_linearised_readings():
     np.testing.assert_array_equal(once().error_root(strange, np.arange(1.0, 5.0)), np.diag(np.arange(1.0, 5.0)))
 
 
-def test_filter_linearises_once_if_the_model_says_so():
-    """Two measurements: the innovations and their covariance are those of voltages linearised about the level, with the
-    model's error in place of the noise."""
+def test_filter_linearises_once_with_an_error_covariance():
+    """For two measurement vectors the innovations and their covariance equal those with voltages linearised about c_ref
+    and the model's error covariance as noise."""
     (example,) = examples("train:0")
     filter_ = inflow_filter(task(), prior(), LEVEL, model=once())
     level = np.full(task().mesh.n_nodes, LEVEL)
@@ -158,11 +157,11 @@ def test_filter_linearises_once_if_the_model_says_so():
         expected = at.value - at.matrix @ filter_.space.concentration(mean) - std * once().mean_voltage_error[number]
         np.testing.assert_allclose(step.innovation_covariance, S, rtol=1e-9, atol=1e-12 * S.max())
         np.testing.assert_allclose(step.innovation, expected, atol=1e-12)
-    with pytest.raises(ValueError, match="model must have voltages that are linearised anew"):
+    with pytest.raises(ValueError, match="model must have voltages that are linearised at each estimate"):
         maximise_posterior(filter_, task(), [], once())
 
 
-def test_learns_from_train_alone():
+def test_only_train_episodes_are_accepted():
     with pytest.raises(ValueError, match=r"seeds must be of the split train.*dev:0"):
         identify_model(examples("dev:0"))
     with pytest.raises(ValueError, match="more states than modes, 24; got 5"):
@@ -172,7 +171,7 @@ def test_learns_from_train_alone():
 
 
 def test_filter_is_gaussian_conditioning():
-    """Three measurements of linear inflows, whose states are off by independent errors of its spread."""
+    """The filter equals conditioning for three measurement vectors, linear inflows and independent state errors."""
     linear = replace(prior(), link="linear")
     filter_ = inflow_filter(task(), linear, LEVEL, model=model())
     random = np.random.default_rng(3)
@@ -210,15 +209,15 @@ def test_filter_is_gaussian_conditioning():
 
 
 def surprise(space, before, covariance, x, voltages, currents):
-    """−2 ln of the density of the newest inflows x given what was known before, and the readings."""
+    """Return −2 ln of the density of the newest inflows x given their prior and the measurements."""
     concentration = space.concentration(x)
     observation = linearise_voltages(task().observation, task().noise, concentration, voltages, currents)
     off = (observation.value - observation.matrix @ concentration) / np.sqrt(observation.noise_variance)
     return (x - before) @ np.linalg.solve(covariance, x - before) + (off**2).sum()
 
 
-def test_a_second_linearisation_is_nearer_to_the_most_probable():
-    """Of the inflows given one measurement; and the innovation is the first one's."""
+def test_iteration_is_closer_to_the_most_probable_inflow():
+    """The second linearisation increases the density given one measurement vector; the innovation is the first one."""
     (example,) = examples("train:0")
     filters = [inflow_filter(task(), prior(), LEVEL, iterated=iterated) for iterated in (False, True)]
     space = filters[0].space
@@ -231,8 +230,8 @@ def test_a_second_linearisation_is_nearer_to_the_most_probable():
     assert values[1] < values[0]
 
 
-def test_smoother_takes_out_the_mean_error():
-    """Readings that exceed the model's by just the mean error are explained by the inflows without it."""
+def test_smoother_subtracts_the_mean_error():
+    """Voltages that exceed the model by exactly the mean error yield the inflows of the exact voltages."""
     (example,) = examples("train:0")
     plain = replace(model(), mean_voltage_error=np.zeros_like(model().mean_voltage_error))
     first = list(zip(example.voltages, example.currents, strict=True))
@@ -247,8 +246,8 @@ def test_smoother_takes_out_the_mean_error():
     np.testing.assert_allclose(with_error.mean, without.mean, atol=0.02)
 
 
-def test_a_file_says_all(tmp_path):
-    """To single precision."""
+def test_files_round_trip(tmp_path):
+    """A saved model is loaded to single precision."""
     model().save(tmp_path / "a.npz")
     again = IdentifiedModel.load(tmp_path / "a.npz")
     np.testing.assert_allclose(again.response.weights, model().response.weights, atol=1e-6)
@@ -264,7 +263,7 @@ def test_a_file_says_all(tmp_path):
     assert not compatible_models(tmp_path, make_task(PIPE_2D))
 
 
-def test_other_files_are_told(tmp_path):
+def test_invalid_files_are_rejected(tmp_path):
     for content in (b"", b"PK", b"{}"):
         (tmp_path / "b.npz").write_bytes(content)
         with pytest.raises(ValueError, match=r"b\.npz must be a model of `eitbench fit model`"):
@@ -281,15 +280,14 @@ def quadratic():
 
 
 def along_modes(size):
-    """A concentration whose logarithm is off by ``size`` in some modes."""
+    """Return a concentration with a deviation of ``size`` in some modes of its logarithm."""
     a = np.random.default_rng(7).standard_normal(model().basis.shape[1])
     u = model().basis @ a
     return LEVEL * np.exp(size * u / np.abs(u).max())
 
 
 def test_quadratic_voltages_are_of_second_order():
-    """Along the modes the error of half the contrast is an eighth; third differences are what is left. It begins with
-    the exact voltages."""
+    """Half the contrast along the modes has an eighth of the error, of third order; the voltages at c_0 are exact."""
     I = task().currents
 
     def off(size):
@@ -301,7 +299,7 @@ def test_quadratic_voltages_are_of_second_order():
 
 
 def test_derivatives_of_quadratic_voltages():
-    """By finite differences along the modes and across all nodes."""
+    """Derivatives agree with finite differences along the modes and at all nodes."""
     I = task().currents
     c = along_modes(0.2)
     _, by_c = quadratic().linearise(c, I)

@@ -1,5 +1,5 @@
-"""Filters of the inflow's history against dense conditioning, transport by steps and finite differences; and the prior
-that is learned from inflows of a known law."""
+"""Inflow-window filters are compared with dense conditioning, the transport and finite differences; priors with the law
+of their samples."""
 
 from functools import lru_cache
 
@@ -34,12 +34,12 @@ LEVEL = 29.0
 
 @lru_cache(maxsize=2)
 def prior(link="logarithm"):
-    """Two modes across the inlet, a correlation over four steps."""
+    """Return a prior of two modes across the inlet, correlated over four steps."""
     return two_modes(task().mesh.points[task().transport.inlet], task().transport.time_step, link)
 
 
 def record(seed=0):
-    """(voltages, currents) of five injections."""
+    """Return (voltages, currents) of five injections."""
     episode = simulate(TINY, seed)
     cycle = TINY.currents
     currents = [cycle[t % len(cycle)] for t in range(TINY.n_steps)]
@@ -51,12 +51,12 @@ def window(link="logarithm", lag=0, law=None):
 
 
 def some_inflows(space, seed=1):
-    """A mean of other inflows than the expected ones."""
+    """Return a mean with random inflows."""
     return 0.5 * np.random.default_rng(seed).standard_normal(2 * space.window_steps)
 
 
 def stepped(inflow, lag=0):
-    """The concentration that the transport makes of inflows (W, n_inlet), the newest first."""
+    """Return the concentration after inflows (W, n_inlet), the newest first, by the transport."""
     transport = task().transport
     deviation = np.zeros(task().mesh.n_nodes)
     nothing = np.zeros(len(transport.inlet))
@@ -67,8 +67,8 @@ def stepped(inflow, lag=0):
     return LEVEL + deviation
 
 
-def test_a_flow_that_changes_carries_each_inflow_by_what_flowed_then():
-    """Inflows carried on step by step, each step by its own transport; before the first it was as in it."""
+def test_responses_of_a_time_varying_flow():
+    """Responses agree with steps of the transport of each time; before t = 0 the first transport holds."""
     nominal, faster = (make_task(TINY.with_changes({"flow": {"mean_velocity": speed}})).transport
                        for speed in (45.0, 60.0))
     transports = [nominal, faster, nominal]
@@ -85,8 +85,8 @@ def test_a_flow_that_changes_carries_each_inflow_by_what_flowed_then():
 
 @pytest.mark.parametrize("link", ["linear", "logarithm"])
 @pytest.mark.parametrize("lag", [0, 2])
-def test_the_history_makes_what_the_flow_makes_of_it(link, lag):
-    """Inflows carried on step by step by the transport: to 3e-3 of what they change, the part that is dropped."""
+def test_window_agrees_with_the_transport(link, lag):
+    """Concentrations agree with the transport to 3e-3 of their change, the truncated part of the response."""
     space = window(link, lag)
     mean = some_inflows(space)
     u = mean.reshape(-1, 2)[:lag + space.response_steps] @ prior(link).modes.T
@@ -97,7 +97,7 @@ def test_the_history_makes_what_the_flow_makes_of_it(link, lag):
 
 @pytest.mark.parametrize("link", ["linear", "logarithm"])
 def test_derivatives_are_those_of_the_concentration(link):
-    """By each of the last inflows, by central differences."""
+    """Derivatives by each of the last inflows agree with central differences."""
     space = window(link, 1)
     mean = some_inflows(space)
     slope = space.jacobian(mean, np.eye(task().mesh.n_nodes)[::40], lag=1)
@@ -109,7 +109,7 @@ def test_derivatives_are_those_of_the_concentration(link):
 
 
 def test_white_inflow_is_table_5_1():
-    """Before anything is measured the variances are those of the white inflow, Σ FᵏYYᵀFᵏᵀ, to what the pipe forgets."""
+    """The prior variances of a white inflow are Σ FᵏYYᵀFᵏᵀ, up to the truncation of the response."""
     filter_ = Filter(window(law=white_inflow(task())))
     filter_.predict()
     F, Y = task().transport.transition()
@@ -122,7 +122,7 @@ def test_white_inflow_is_table_5_1():
 
 
 def test_prediction_keeps_the_prior():
-    """Where nothing is measured, mean and covariance stay those of a stationary process."""
+    """Without measurements, mean and covariance of the stationary process do not change."""
     filter_ = Filter(window())
     before = filter_.covariance.array.copy()
     for _ in range(30):
@@ -140,7 +140,7 @@ def most_probable():
 
 
 def density(smoother, x, std):
-    """−2 ln of the posterior density, from its parts."""
+    """Return −2 ln of the posterior density as the sum of prior and misfit."""
     space = smoother.space
     precision = np.linalg.inv(toeplitz(prior().time_covariance(space.window_steps)))
     value = np.einsum("ik,ij,jk->", x.reshape(-1, 2), precision, x.reshape(-1, 2))
@@ -150,8 +150,8 @@ def density(smoother, x, std):
     return value
 
 
-def test_nothing_is_more_probable():
-    """Twenty steps in any direction, ahead and back, lead to a lower density, and so has the smoothed history."""
+def test_map_estimate_maximises_the_density():
+    """Steps in twenty random directions, and the result of the linear smoother, have a lower density."""
     smoother, first = most_probable()
     best, at = smoother.mean, smoother.space.concentration
     std = [task().noise.std(task().observation.voltages(at(first, len(record()) - 1 - t), I[None])[0])
@@ -165,9 +165,8 @@ def test_nothing_is_more_probable():
         assert density(smoother, best - step, std) > least
 
 
-def test_learns_the_law_of_what_it_is_shown():
-    """u = E x with x autoregressive, ρ = 0.7: Γ_across and the correlation of the next steps come out, the closer the
-    more episodes there are."""
+def test_fits_the_law_of_the_samples():
+    """For u = E x with x autoregressive, ρ = 0.7, Γ_across and the correlation converge with the number of episodes."""
     random = np.random.default_rng(4)
     E = np.array([[0.2, 0.0], [0.15, 0.1], [0.0, 0.2]])
     off = []
@@ -182,8 +181,8 @@ def test_learns_the_law_of_what_it_is_shown():
     assert off[1] < 0.02 and off[1] < off[0] / 3
 
 
-def test_a_correlation_is_one():
-    """Whatever the sample, the covariance in time has no negative eigenvalue."""
+def test_correlation_is_positive_semidefinite():
+    """The covariance in time has no negative eigenvalue for any sample."""
     random = np.random.default_rng(6)
     for _ in range(20):
         ratios = np.exp(0.1 * random.standard_normal((2, 30, 3)).cumsum(axis=1))
@@ -193,7 +192,7 @@ def test_a_correlation_is_one():
 
 
 def test_inflows_are_those_of_the_simulation():
-    """At the truth's inlet, where its nodes are the model's too."""
+    """Sampled inflows equal the simulated concentration at common inlet nodes of truth and model."""
     sampled = TINY.sample_inflow(3)
     assert sampled.shape == (TINY.spin_up_steps + TINY.n_steps + 1, 21)
     truth = cached_truth_model(TINY).transport
@@ -206,14 +205,14 @@ def test_inflows_are_those_of_the_simulation():
     np.testing.assert_allclose(sampled[TINY.spin_up_steps:, here], simulated[:, there], rtol=1e-6)
 
 
-def test_learns_from_train_alone():
+def test_only_train_episodes_are_accepted():
     with pytest.raises(ValueError, match=r"seeds must be of the split train.*dev:0"):
         fit_prior_from_episodes(TINY, parse_seeds("dev:0-3"))
     with pytest.raises(ValueError, match="target must have an inflow, got"):
         fit_prior_from_episodes(STATIONARY_TANK, [0])
 
 
-def test_a_file_says_all(tmp_path):
+def test_files_round_trip(tmp_path):
     prior().save(tmp_path / "a.json")
     again = InflowPrior.load(tmp_path / "a.json")
     np.testing.assert_allclose(again.modes, prior().modes, rtol=1e-8)
@@ -224,8 +223,8 @@ def test_a_file_says_all(tmp_path):
     assert not compatible_priors(tmp_path, make_task(ROTATING_TANK), "logarithm")
 
 
-def test_an_inlet_that_hardly_differs_is_the_same():
-    """Behind the obstacle's inlet, whose nodes lie nanometres beside the straight pipe's; not those of half a pipe."""
+def test_inlets_are_compared_with_a_tolerance():
+    """The obstacle's inlet nodes, nanometres from the straight pipe's, match; the inlet of half a pipe does not."""
     shipped = InflowPrior.load(baseline_folder() / "priors" / "pipe2d-logarithm.json")
     assert shipped.matches_task(make_task(PIPE_2D_OBSTACLE))
     narrow = TINY.with_changes({"vessel": {"half_width": 0.04}})
@@ -233,14 +232,14 @@ def test_an_inlet_that_hardly_differs_is_the_same():
 
 
 @pytest.mark.parametrize("text", ["", "[]", "{", '{"link": "linear"}', '{"link": 3}'])
-def test_other_files_are_told(tmp_path, text):
+def test_invalid_files_are_rejected(tmp_path, text):
     (tmp_path / "a.json").write_text(text)
     with pytest.raises(ValueError, match=r"a\.json must be a prior of `eitbench fit prior`"):
         InflowPrior.load(tmp_path / "a.json")
 
 
-def test_what_does_not_fit_is_told():
-    with pytest.raises(ValueError, match=r"the prior must be of the task's inlet, 0 nodes"):
+def test_invalid_arguments_are_rejected():
+    with pytest.raises(ValueError, match=r"the prior must be for the task's inlet, 0 nodes"):
         InflowWindow(make_task(ROTATING_TANK), prior(), LEVEL)
     with pytest.raises(ValueError, match="link must be one of linear, logarithm, got 'log'"):
         InflowPrior("log", prior().points, prior().modes, prior().correlation, 0.005)
@@ -248,5 +247,5 @@ def test_what_does_not_fit_is_told():
         InflowPrior("linear", prior().points, prior().modes, np.array([0.9, 0.1]), 0.005)
     with pytest.raises(ValueError, match="ratios must be above 0, got -1"):
         fit_inflow_prior(np.full((1, 40, 3), -1.0), np.zeros((3, 2)), 0.005)
-    with pytest.raises(ValueError, match="ratios must change"):
+    with pytest.raises(ValueError, match="ratios must vary"):
         fit_inflow_prior(np.ones((1, 40, 3)), np.zeros((3, 2)), 0.005)

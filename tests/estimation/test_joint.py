@@ -1,4 +1,4 @@
-"""Concentration and velocity as one state against the textbook, differences, and a known truth."""
+"""The joint filter of concentration and velocity is compared with the textbook, differences and a simulated truth."""
 
 import numpy as np
 import pytest
@@ -14,7 +14,7 @@ def transport_at(theta):
 
 
 def relative(k):
-    """`shapes` in parts of the nominal velocity."""
+    """Return `shapes` relative to the nominal velocity."""
     return shapes(k) / (shapes(k) @ NOMINAL[:k])[:, None]
 
 
@@ -33,7 +33,7 @@ def joint_filter(k=1, **changes):
 
 
 def theta_of(filter_):
-    """Present parameters and their variances."""
+    """Return the present parameters and their variances."""
     return filter_.space.velocity(filter_.mean, filter_.covariance)
 
 
@@ -42,7 +42,7 @@ def sensors(rng, m=16):
 
 
 def started(rng, k=3):
-    """A filter some steps on its way, so that concentration and velocity are correlated, and what it sees next."""
+    """Return a filter after some steps, with correlated concentration and velocity, and its next measurement."""
     filter_ = joint_filter(k)
     for _ in range(3):
         filter_.predict()
@@ -52,15 +52,15 @@ def started(rng, k=3):
 
 
 def textbook_update(mean, P, observation, k):
-    """The unconstrained update of (c, θ), where θ is not seen."""
+    """Return the unconstrained update of (c, θ), with measurements of c only."""
     H = np.hstack([observation.matrix, np.zeros((len(observation.value), k))])
     S = H @ P @ H.T + np.diag(observation.noise_variance)
     K = np.linalg.solve(S, H @ P).T
     return mean + K @ (observation.value - H @ mean), P - K @ H @ P, S
 
 
-def test_one_step_is_that_of_the_textbook():
-    """Predict and update with full matrices [[F, ∂c⁺/∂θ], [0, I]] put together here: mean and covariance to 1e-10."""
+def test_one_step_equals_the_textbook():
+    """Mean and covariance agree to 1e-10 with an update by the dense matrices [[F, ∂c⁺/∂θ], [0, I]]."""
     filter_, observation = started(np.random.default_rng(2))
     c, theta, P = filter_.mean[:N].copy(), filter_.mean[N:].copy(), filter_.covariance.array.copy()
     transport = transport_at(theta)
@@ -88,7 +88,7 @@ def test_one_step_is_that_of_the_textbook():
 
 
 def test_covariance_moves_with_the_derivative_of_the_prediction():
-    """Without noise the covariance becomes A Γ Aᵀ, A the differences of what `predict` makes of (c, θ)."""
+    """Without noise the covariance becomes A Γ Aᵀ, with A the finite differences of `predict` by (c, θ)."""
     rng, k, h = np.random.default_rng(3), 3, 1e-4
     c, theta = C_BH + 3 * rng.normal(size=N), np.array([4.0, 1.0, 0.4])
     quiet = {"nodal_noise": np.zeros((N, N)), "inflow_std": 0.0, "walk_std": np.zeros(k)}
@@ -111,8 +111,8 @@ def test_covariance_moves_with_the_derivative_of_the_prediction():
 
 
 @pytest.mark.parametrize("truth", [[3.2], [5.8], [4.0, 1.2, 0.4]], ids=["slow", "fast", "skew"])
-def test_velocity_is_found(truth):
-    """A truth of the filter's own model, started one to two σ off: θ within its 3σ, and the profile to 5 %."""
+def test_velocity_is_estimated(truth):
+    """For a truth of the filter's model, one to two σ from the prior, θ is within 3σ and the profile within 5 %."""
     rng, truth = np.random.default_rng(4), np.array(truth)
     k, transport = len(truth), transport_at(truth)
     filter_ = joint_filter(k, walk_std=np.zeros(k), nodal_noise=1e-4 * np.eye(N))
@@ -132,11 +132,11 @@ def test_velocity_is_found(truth):
 @pytest.mark.parametrize(("k", "far"), [(1, -8.0), (1, 40.0), (3, -8.0), (3, 40.0)],
                          ids=["backwards", "too fast", "skew backwards", "skew too fast"])
 def test_velocity_stays_within_its_bounds(k, far):
-    """Where a measurement says otherwise, θ stops at the bound on the line from θ_0; c moves as if there were none."""
+    """If a measurement implies a θ beyond the bounds, θ is at the bound on the line from θ_0; c is not constrained."""
     filter_, observation = started(np.random.default_rng(5), k)
     filter_.predict()
     mean, P = filter_.mean.copy(), filter_.covariance.array.copy()
-    # What must be measured so that the mean velocity would become ``far``.
+    # Measurement that would change the mean velocity to ``far``.
     expected, push = observation.matrix @ mean[:N], observation.matrix @ P[:N, N]
     gained = textbook_update(mean, P, observation._replace(value=expected + push), k)[0][N] - mean[N]
     observation = observation._replace(value=expected + push * (far - mean[N]) / gained)
@@ -164,6 +164,6 @@ def test_velocity_stays_within_its_bounds(k, far):
     ({"bounds": (0.0, 5.0)}, "^bounds"), ({"bounds": (0.1, 0.9)}, "^bounds"), ({"bounds": (1.5, 2.0)}, "^bounds"),
 ])
 def test_errors_name_the_argument(changes, name):
-    """What does not fit, walls among the profiles, and bounds without the first velocity are refused by name."""
+    """Wrong shapes, profiles at walls, and bounds that exclude the nominal velocity raise an error with the name."""
     with pytest.raises(ValueError, match=name):
         joint_filter(**changes)

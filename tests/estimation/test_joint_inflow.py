@@ -1,5 +1,5 @@
-"""The joint filter of inflow and flow against the transport stepped by hand, the filter of a known flow, the joint
-filter with a white inflow, and a known truth."""
+"""The joint filter of inflow and velocity is compared with the transport, the filter of a known velocity, the joint
+filter with a white inflow, and a simulated truth."""
 
 from dataclasses import replace
 from functools import lru_cache
@@ -32,7 +32,7 @@ def transport_at(theta):
 
 
 def flow(std=(1.0, 2.0), walk=(0.05, 0.02)):
-    """v = θ_1 v_1 + θ_2 v_2 with a mean of 4.5 m/s at first, which passes the pipe in 18 steps."""
+    """Return the prior of v = θ_1 v_1 + θ_2 v_2 with nominal mean 4.5 m/s, a residence time of 18 steps."""
     return VelocityPrior(transport_at, DIRECTIONS, np.array([4.5, 0.0]), np.array(std), np.array(walk), shapes(2))
 
 
@@ -41,7 +41,7 @@ def started(belief, window, law=None):
 
 
 def theta_of(filter_):
-    """Present parameters and their variances."""
+    """Return the present parameters and their variances."""
     return filter_.space.velocity(filter_.mean, filter_.covariance)
 
 
@@ -67,8 +67,8 @@ def near(actual, expected, part):
 
 
 def stepped(z, steps):
-    """The concentration that z (steps + W, 2 + 2), the oldest first, makes of a pipe full of c_bh: the first W at the
-    velocity believed at first, the others at their own."""
+    """Return the concentration after z (steps + W, 2 + 2), the oldest first, from a pipe at c_bh: the first W at the
+    nominal velocity, the others at their velocities."""
     c, before = np.full(N, LEVEL), LEVEL
     for number, (x, theta) in enumerate(zip(z[:, :2], z[:, 2:], strict=True)):
         after = LEVEL * np.exp(prior().modes @ x)
@@ -78,8 +78,8 @@ def stepped(z, steps):
 
 
 def test_concentration_and_derivatives_are_those_of_the_transport():
-    """Four steps from other inflows than the expected ones: the concentration to 1e-10, and its derivatives by inflows
-    and by the velocity of each step to 1e-6 of the largest, by central differences."""
+    """After four steps with random inflows the concentration agrees to 1e-10, and its derivatives by inflows
+    and by the velocity of each step to 1e-6 of the largest, with central differences."""
     W, steps, h = 12, 4, 1e-4
     filter_ = started(flow(), W)
     start = filter_.mean.reshape(W, 4).copy()
@@ -99,9 +99,9 @@ def test_concentration_and_derivatives_are_those_of_the_transport():
 
 
 def test_a_white_inflow_gives_the_joint_filter():
-    """From the same covariance of c, of all inflows before, and with a constant velocity: means, covariances and
-    innovations of ten steps to 1e-7, which is what inflows have left that fell out of the window. (Where θ walks, a
-    step moves the fluid at once here, and one time step later there.)"""
+    """For the same initial covariance and a constant velocity, means, covariances and innovations of ten steps agree
+    to 1e-7, the contribution of inflows beyond the window. (If θ walks, a step advects the fluid immediately here,
+    and one time step later in the joint filter.)"""
     belief = flow(walk=(0.0, 0.0))
     filter_ = started(belief, 90, white_inflow(task()))
     slope = filter_.space.jacobian(filter_.mean, np.eye(N))
@@ -120,8 +120,8 @@ def test_a_white_inflow_gives_the_joint_filter():
 
 
 @pytest.mark.parametrize("truth", [[3.4, 0.0], [5.0, 1.2]], ids=["slow", "skew"])
-def test_velocity_is_found(truth):
-    """Inflows of the prior's own law in a flow one to two σ off: θ to 5 %, within its 3σ."""
+def test_velocity_is_estimated(truth):
+    """For inflows sampled from the prior and a velocity one to two σ from its mean, θ is within 5 % and within 3σ."""
     random = np.random.default_rng(3)
     process = np.linalg.cholesky(np.array([[prior().time_covariance(80)[abs(i - j)] for i in range(80)]
                                            for j in range(80)])) @ random.standard_normal((80, 2))
@@ -144,7 +144,7 @@ def test_velocity_is_found(truth):
 
 
 def test_velocity_stays_within_its_bounds():
-    """A measurement that says the fluid flows back moves the velocity to the least that is possible."""
+    """A measurement that implies backflow moves the velocity to its lower bound."""
     filter_ = started(flow((3.0, 0.0), (0.05, 0.0)), 12)
     for observation in observations(4):
         filter_.predict()
@@ -152,7 +152,7 @@ def test_velocity_stays_within_its_bounds():
     filter_.predict()
     (observation,) = observations(1, seed=8)
     slope = filter_.space.jacobian(filter_.mean, observation.matrix)
-    by_theta = slope @ filter_.covariance.array[:, 2]                           # how readings vary with θ_1
+    by_theta = slope @ filter_.covariance.array[:, 2]                           # derivatives by θ_1
     value = observation.matrix @ filter_.concentration - 1e3 * by_theta
     filter_.update(observation._replace(value=value))
     assert theta_of(filter_)[0][0] == pytest.approx(0.05 * 4.5)
@@ -160,8 +160,8 @@ def test_velocity_stays_within_its_bounds():
     assert np.isfinite(filter_.concentration).all()
 
 
-def test_flows_of_a_task():
-    """What a task asks for is believed as it says; what it tells is the transport itself at a factor of 1."""
+def test_velocity_priors_of_a_task():
+    """An unknown velocity has the task's prior; a specified velocity is the task's transport at a factor of 1."""
     asked = task_velocity_prior(make_task(PIPE_2D_SKEWED))
     np.testing.assert_array_equal(asked.initial, [4.5, 0.0, 0.0])
     np.testing.assert_array_equal(asked.initial_std, [1.0, 3.0, 1.0])
@@ -173,8 +173,8 @@ def test_flows_of_a_task():
     assert (told.initial_std, told.walk_std) == (0.3, 0.01)
 
 
-def test_what_does_not_fit_is_told():
-    with pytest.raises(ValueError, match="task must ask for the flow"):
+def test_invalid_arguments_are_rejected():
+    with pytest.raises(ValueError, match="task must have an unknown velocity"):
         task_velocity_prior(task())
     with pytest.raises(ValueError, match="task must have a flow, got StationaryTransport"):
         scaled_velocity_prior(make_task(STATIONARY_TANK_2D), 0.3, 0.0)
@@ -186,5 +186,5 @@ def test_what_does_not_fit_is_told():
         started(flow(), 0)
     with pytest.raises(ValueError, match="bounds must be a range"):
         replace(flow(), bounds=(0.5, 0.9))
-    with pytest.raises(ValueError, match="the prior must be of the task's inlet"):
+    with pytest.raises(ValueError, match="the prior must be for the task's inlet"):
         VelocityInflowWindow(make_task(TINY), prior(), LEVEL, flow(), 12)

@@ -1,5 +1,5 @@
-"""Filters and smoothers against cuthbert, an independent implementation in JAX (square-root forms, derivatives by
-automatic differentiation)."""
+"""Filters and smoothers agree with cuthbert, an independent implementation in JAX (square-root forms, automatic
+differentiation)."""
 
 import numpy as np
 import pytest
@@ -28,14 +28,14 @@ T = 8
 
 
 def assert_gaussians(means, covariances, states):
-    """Means (T, n) and square roots (T, n, n) of covariances, to 1e-9 of the largest entry."""
+    """Compare means (T, n) and square roots (T, n, n) of covariances to 1e-9 of the largest entry."""
     variances = (np.asarray(covariances)**2).sum(axis=2)
     for theirs, ours in ((means, [state.mean for state in states]), (variances, [state.variance for state in states])):
         np.testing.assert_allclose(ours, theirs, rtol=0, atol=1e-9 * np.abs(theirs).max())
 
 
 def dynamics(model):
-    """F, s and a square root of Q."""
+    """Return F, s and a square root of Q."""
     root = np.linalg.cholesky(model.Q)
     return lambda inputs: (model.F, model.s, root)
 
@@ -61,7 +61,7 @@ def test_linear_gaussian_model():
 
 @pytest.mark.parametrize("logarithm", [False, True], ids=["concentration", "logarithm"])
 def test_extended_filter(logarithm):
-    """Voltages that are quadratic in the concentration, linearised about each prediction."""
+    """Extended filters agree for voltages that are quadratic in the concentration."""
     rng = np.random.default_rng(4)
     n, electrodes, std = 6, 4, 0.5
     model = random_model(rng, n)

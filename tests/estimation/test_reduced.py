@@ -1,4 +1,4 @@
-"""The reduced filter against the textbook, and against the full filter when nothing is left out."""
+"""The reduced filter agrees with the textbook, and at full rank with the full filter."""
 
 import numpy as np
 import pytest
@@ -10,7 +10,7 @@ from models import LinearGaussian, dense_filter, draw, random_design, random_mod
 
 @pytest.fixture
 def world():
-    """A model around zero in Schur form with 14 states, and three records under three designs."""
+    """Return a model of 14 states in Schur form with zero mean, and three measurement sequences with three designs."""
     rng = np.random.default_rng(12)
     model = random_model(rng)
     F, rotation = scipy.linalg.schur(model.F)
@@ -20,7 +20,7 @@ def world():
 
 
 def run(filter_: ReducedFilter, records: list[list[LinearMeasurement]]):
-    """Means (T, B, r), covariances, innovations and their variances of records side by side."""
+    """Return means (T, B, r), covariances, innovations and their variances for a batch of measurement sequences."""
     steps = []
     for t in range(len(records[0])):
         matrix, value, variance = (np.stack([record[t][part] for record in records]) for part in range(3))
@@ -41,8 +41,8 @@ def assert_close(ours, theirs, tolerance):
     np.testing.assert_allclose(ours, theirs, rtol=0, atol=tolerance * np.abs(theirs).max())
 
 
-def test_three_records_side_by_side_are_the_textbook(world):
-    """Means and covariances of each record equal the dense recursion's, whose designs differ, to 1e-10."""
+def test_batch_equals_the_textbook(world):
+    """Means and covariances of each sequence, with different designs, equal the dense recursion to 1e-10."""
     model, records = world
     means, covariances, innovations, S = run(started(model, 3), records)
     for b, record in enumerate(records):
@@ -54,16 +54,16 @@ def test_three_records_side_by_side_are_the_textbook(world):
             assert_close(S[t, b], (H @ predicted.covariance @ H.T).diagonal() + variance, 1e-10)
 
 
-def test_a_record_keeps_its_bits_beside_others(world):
-    """What is filtered beside it changes nothing."""
+def test_results_do_not_depend_on_the_batch(world):
+    """Results of a sequence are bit-identical alone and in a batch."""
     model, records = world
     together, alone = run(started(model, 3), records), run(started(model, 1), records[1:2])
     for ours, theirs in zip(together, alone, strict=True):
         np.testing.assert_array_equal(ours[:, 1:2], theirs)
 
 
-def test_in_all_directions_it_is_the_full_filter(world):
-    """With as many coordinates as states nothing is lost: Φ a and Φ P Φᵀ are the full filter's, in any metric."""
+def test_full_rank_equals_the_full_filter(world):
+    """At full rank, Φ a and Φ P Φᵀ equal the full filter for any mass matrix."""
     rng = np.random.default_rng(3)
     plain = random_model(rng)
     model = plain._replace(s=np.zeros(14), mean=np.zeros(14))
@@ -82,8 +82,8 @@ def test_in_all_directions_it_is_the_full_filter(world):
         assert_close((basis @ covariances[t, 0] @ basis.T).diagonal(), step.variance, 1e-8)
 
 
-def test_the_directions_are_those_in_which_the_filter_learns(world):
-    """The basis holds more of Σ Z Zᵀ than any other of its size tried: no random subspace comes near."""
+def test_basis_holds_the_largest_reduction(world):
+    """The basis contains more of Σ Z Zᵀ than random subspaces of the same size."""
     model, records = world
     learnt, filter_ = 0.0, model.filter()
     for observation in records[0]:

@@ -1,4 +1,4 @@
-"""Concentration and mean velocity together in few coordinates: the tables and the filter."""
+"""Reduced joint filter of concentration and mean velocity: splines and recursion."""
 
 import numpy as np
 import pytest
@@ -8,7 +8,7 @@ from eitbench.estimation.reduced_joint import JointStates, TransitionSplines, jo
 
 @pytest.fixture(scope="module")
 def model():
-    """F(θ) and Γ_w(θ) that are cubic in θ, which the tables hold exactly, projected onto 5 of 8 directions."""
+    """Return cubic F(θ) and Γ_w(θ), for which the splines are exact, projected onto 5 of 8 directions."""
     rng = np.random.default_rng(0)
     parts, roots = 0.2 * rng.normal(size=(4, 8, 8)), rng.normal(size=(4, 8, 8))
     root = rng.normal(size=(8, 8))
@@ -23,8 +23,8 @@ def model():
     return joint_model(basis, mass, np.eye(8), velocities, map(step, velocities)), basis, mass, step
 
 
-def test_tables_are_galerkins_projection(model):
-    """At velocities between those of the table, and with derivatives that are those of finite differences."""
+def test_tables_equal_the_galerkin_projection(model):
+    """The splines are exact between the tabulated velocities, and derivatives agree with finite differences."""
     made, basis, mass, step = model
     tables, theta, small = TransitionSplines(made), np.array([1.0, 2.3, 4.4, 5.9]), 1e-5
     A, slope, W = tables.evaluate(theta)
@@ -36,11 +36,11 @@ def test_tables_are_galerkins_projection(model):
     difference = (tables.evaluate(inner + small)[0] - tables.evaluate(inner - small)[0]) / (2 * small)
     np.testing.assert_allclose(slope[1:], difference, atol=1e-8)
     for a, b in zip(tables.evaluate(np.array([0.0, 9.0])), tables.evaluate(made.velocities[[0, -1]]), strict=True):
-        np.testing.assert_array_equal(a, b)                # beyond the table as at its ends
+        np.testing.assert_array_equal(a, b)                # constant extrapolation
 
 
-def test_filter_is_the_textbooks(model):
-    """Means and covariances are those of a dense joint EKF, written out here, for each of three records."""
+def test_filter_equals_the_textbook(model):
+    """Means and covariances of three sequences equal a dense joint EKF."""
     tables, rng, walk, bounds = TransitionSplines(model[0]), np.random.default_rng(1), 0.3, (2.5, 4.5)
     mean = np.column_stack([rng.normal(size=(3, 5)), [3.0, 4.0, 4.4]])
     roots = rng.normal(size=(3, 6, 6))

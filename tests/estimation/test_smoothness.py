@@ -1,4 +1,4 @@
-"""The smoothness prior against its continuum, and the tank at rest: the Kalman filter is a linearised MAP estimate."""
+"""The smoothness prior agrees with its continuum, and for a stationary tank the filter is a linearised MAP estimate."""
 
 from functools import lru_cache
 from types import SimpleNamespace
@@ -20,7 +20,7 @@ LENGTH, STD = 0.1, 2.0
 
 @pytest.fixture(scope="module")
 def square():
-    """A unit square of 1,681 nodes, a tenth of which is one correlation length: mesh, M and Γ."""
+    """Return mesh, M and Γ for a unit square of 1,681 nodes with a correlation length of 0.1."""
     mesh = rectangle_mesh(np.linspace(0.0, 1.0, 41), np.linspace(0.0, 1.0, 41))
     mass = mass_matrix(mesh)
     covariance = smoothness_covariance(mass, stiffness_matrix(mesh), LENGTH, STD)
@@ -28,31 +28,31 @@ def square():
 
 
 def node_at(mesh, x, y):
-    """Number of the node nearest to (x, y)."""
+    """Return the index of the node closest to (x, y)."""
     return int(np.hypot(*(mesh.points - np.array([x, y])).T).argmin())
 
 
 def test_covariance_is_symmetric_and_positive_definite(square):
-    """To the bit the one, and with a smallest eigenvalue far above rounding the other."""
+    """Γ is exactly symmetric, and its smallest eigenvalue is far above rounding."""
     np.testing.assert_array_equal(square.covariance, square.covariance.T)
     values = eigvalsh(square.covariance)
     assert values[0] > 1e-6 * values[-1]
 
 
 @pytest.mark.parametrize("std", [0.5, 2.0])
-def test_mean_variance_is_that_asked_for(std):
-    """∫ Γ(x, x) dx over the area is std², on a mesh whose nodes stand for unequal parts of it."""
+def test_mean_variance_equals_the_argument(std):
+    """∫ Γ(x, x) dx over the area is std², on a mesh of non-uniform cells."""
     mesh = uniform_disc(0.14, 12)
     mass = mass_matrix(mesh)
     covariance = smoothness_covariance(mass, stiffness_matrix(mesh), 0.03, std)
     weights = np.asarray(mass.sum(axis=0)).ravel()
     assert weights @ covariance.diagonal() / weights.sum() == pytest.approx(std**2, rel=1e-12)
-    # near the wall values are less bound
+    # the variance is larger near the wall
     assert np.ptp(covariance.diagonal()) > 0.5 * std**2
 
 
 def test_correlation_is_that_of_a_matern_field(square):
-    """r·K₁(r) with r = d/ℓ, in the middle of a mesh fine and large against ℓ: 0.60 at ℓ, 0.12 at 3ℓ."""
+    """The correlation is r·K₁(r) with r = d/ℓ in the middle of a fine, large mesh: 0.60 at ℓ, 0.12 at 3ℓ."""
     mesh, covariance = square.mesh, square.covariance
     middle = node_at(mesh, 0.5, 0.5)
     r = np.hypot(*(mesh.points - mesh.points[middle]).T) / LENGTH
@@ -66,7 +66,7 @@ def test_correlation_is_that_of_a_matern_field(square):
 
 
 def test_walls_mirror_the_field(square):
-    """∂x/∂n = 0 is a mirror: twice the variance of the middle on a wall, four times in a corner."""
+    """For ∂x/∂n = 0 the variance is twice the value of the middle on a wall, and four times in a corner."""
     variance = square.covariance.diagonal()
     inside = variance[node_at(square.mesh, 0.5, 0.5)]
     assert variance[node_at(square.mesh, 0.0, 0.5)] / inside == pytest.approx(2.0, rel=0.01)
@@ -77,19 +77,19 @@ def test_walls_mirror_the_field(square):
     ("far", 1.0, "length must be a number in m"), (0.1, 0.0, "std must be"),
 ])
 def test_errors_name_the_argument(length, std, message):
-    """Neither a length nor a standard deviation may be zero or below."""
+    """Length and standard deviation must be positive."""
     mesh = uniform_disc(0.14, 2)
     with pytest.raises(ValueError, match=message):
         smoothness_covariance(mass_matrix(mesh), stiffness_matrix(mesh), length, std)
 
 
 C_BH = 32.0
-"""mol/m³, as if it were the best homogeneous estimate: where the observations are linearised, and the prior's mean."""
+"""Substitute for ĉ_bh in mol/m³: linearisation point of the voltages and prior mean."""
 
 
 @lru_cache(maxsize=1)
 def frame():
-    """The tank's task, and one frame of its voltages, as the model itself computes them for a disc, with noise."""
+    """Return the tank's task, and one frame of voltages that the estimator's model computes for a disc, with noise."""
     task = make_task(STATIONARY_TANK_2D)
     rng = np.random.default_rng(4)
     target = 30.0 * (1.0 + disc_indicator(task.mesh.points, np.array([0.05, 0.02]), 0.03, 0.01))
@@ -99,7 +99,7 @@ def frame():
 
 
 def filtered(order):
-    """Mean and covariance (full) of the filter with F = I after the injections of this order."""
+    """Return mean and full covariance of the filter with F = I after injections in this order."""
     task, voltages = frame()
     filter_ = nodal_filter(task.transport, task.prior, C_BH)
     observe = LinearisedForwardModel(task.observation, task.noise, np.full(task.mesh.n_nodes, C_BH))
@@ -110,7 +110,7 @@ def filtered(order):
 
 
 def prior():
-    """Γ of the task by itself, from its mesh and its numbers."""
+    """Return Γ computed from the task's mesh and parameters."""
     task, _ = frame()
     return smoothness_covariance(mass_matrix(task.mesh), stiffness_matrix(task.mesh),
                                  task.prior.initial_length,
@@ -118,21 +118,21 @@ def prior():
 
 
 def linear_model():
-    """R(c*) (16, L), J (16, L, n) at c* = ĉ_bh and the standard deviations of the noise there."""
+    """Return R(c*) (16, L), J (16, L, n) and the noise standard deviations at c* = ĉ_bh."""
     task, _ = frame()
     computed, jacobian = task.observation.linearise(np.full(task.mesh.n_nodes, C_BH), task.currents)
     return computed, jacobian, task.noise.std(computed)
 
 
 def assert_close(one, other, tolerance):
-    """The difference is a small part of the largest entry."""
+    """Compare with a tolerance relative to the largest entry."""
     np.testing.assert_allclose(one, other, rtol=0.0, atol=tolerance * np.abs(other).max())
 
 
 def test_filter_of_a_frame_is_the_linearised_map_estimate():
-    """Mean and covariance after 16 injections: min ‖L_v(V − R(c*) − J(c − c*))‖² + (c − c₀)ᵀ Γ⁻¹ (c − c₀), to 1e-8.
+    """Mean and covariance after 16 injections minimise ‖L_v(V − R(c*) − J(c − c*))‖² + (c − c₀)ᵀ Γ⁻¹ (c − c₀), to 1e-8.
 
-    c₀ = c* = ĉ_bh; solved by the normal equations, whose matrix is the inverse of the estimate's covariance.
+    c₀ = c* = ĉ_bh; the matrix of the normal equations is the inverse of the covariance.
     """
     computed, jacobian, std = linear_model()
     n = jacobian.shape[-1]
@@ -142,13 +142,13 @@ def test_filter_of_a_frame_is_the_linearised_map_estimate():
     mean, covariance = filtered(range(16))
     assert_close(mean - C_BH, cho_solve(information, weighted.T @ residual), 1e-8)
     assert_close(covariance, cho_solve(information, np.eye(n)), 1e-8)
-    # it has learnt something
+    # the data reduce the variance
     assert np.ptp(mean) > 10.0
     assert covariance.trace() < 0.7 * prior().trace()
 
 
 def test_evolution_is_the_identity():
-    """F = I with an H like any other task's, and no inlet: nodal noise adds up as it is."""
+    """The evolution model has F = I, an H as in other tasks, and an empty inlet: nodal noise is added directly."""
     task, _ = frame()
     n = task.mesh.n_nodes
     F, Y, H = task.evolution

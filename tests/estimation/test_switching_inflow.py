@@ -1,4 +1,4 @@
-"""The filter of two regimes against exhaustive enumeration of what may have come when; and what is learned of them."""
+"""Filters with two regimes are compared with exhaustive enumeration of regime sequences; fit of the regimes."""
 
 import itertools
 from dataclasses import replace
@@ -25,7 +25,7 @@ ROWS = 4
 
 
 def prior(begins, ends):
-    """Two modes across the inlet, a correlation over four steps; linear, so that enumeration is exact."""
+    """Return a prior of two modes, correlated over four steps; linear, so that enumeration is exact."""
     points = task().mesh.points[task().transport.inlet]
     return two_modes(points, task().transport.time_step, "linear", 0.1, Regimes(begins, ends, 1e-3))
 
@@ -35,7 +35,7 @@ def switching(begins, ends):
 
 
 def observations(count, slug=2.5):
-    """Averages over parts of the pipe near the inlet, where a slug comes in at the third."""
+    """Return averages over regions near the inlet, with a slug that enters at the third step."""
     random = np.random.default_rng(2)
     x = task().mesh.points[:, 0]
     for t in range(count):
@@ -46,13 +46,13 @@ def observations(count, slug=2.5):
 
 
 def enumerated(filter_, regimes, measured):
-    """Probability that the last regime is a slug, mean and variance of the last concentration: every sequence of
-    regimes with a textbook Kalman filter of its own, from the same beginning, weighed by its prior and its fit."""
+    """Return the probability that the last regime is a slug, mean and variance of the last concentration, from a
+    textbook Kalman filter for every regime sequence, weighted by prior and likelihood."""
     quiet, _ = filter_.filters
     space = quiet.space
     W, r = space.window_steps, space.n_modes
     basis, weights = space.response()
-    # (n, W·r) what the window makes of itself, by the response's own columns
+    # (n, W·r) concentration by the window, from the response's columns
     G = LEVEL * basis @ np.tensordot(weights, space.prior.modes, 1).reshape(len(weights), -1)
     G = np.concatenate([G, np.zeros((len(G), (W - weights.shape[1]) * r))], axis=1)
     steps = []
@@ -94,7 +94,7 @@ def filtered(filter_, measured):
 
 @pytest.mark.parametrize("begins, ends, steps", [(0.2, 0.3, 1), (1e-13, 2e-13, 5)], ids=["one step", "no change"])
 def test_exact_where_nothing_is_mixed(begins, ends, steps):
-    """After one measurement, and where the regime never changes: probability, mean and variance to 1e-6."""
+    """Probability, mean and variance are exact to 1e-6 after one step, and if the regime never changes."""
     measured = list(observations(steps, slug=1.0))
     expected = enumerated(switching(begins, ends), Regimes(begins, ends, 1e-3), measured)
     actual = filtered(switching(begins, ends), measured)
@@ -104,8 +104,8 @@ def test_exact_where_nothing_is_mixed(begins, ends, steps):
     np.testing.assert_allclose(actual[2], expected[2], rtol=1e-6)
 
 
-def test_near_enumeration_where_regimes_change():
-    """Of 64 sequences: the mean to a fifth of the standard deviation, the probability to 0.1; and it sees the slug."""
+def test_close_to_enumeration_where_regimes_change():
+    """For 64 sequences the mean agrees to a fifth of the standard deviation, the slug's probability to 0.1."""
     measured = list(observations(5))
     slug, mean, variance = enumerated(switching(0.1, 0.2), Regimes(0.1, 0.2, 1e-3), measured)
     ours = filtered(switching(0.1, 0.2), measured)
@@ -115,7 +115,7 @@ def test_near_enumeration_where_regimes_change():
 
 
 def test_innovations_are_those_of_the_mixture():
-    """Mean and covariance of what is read, of both regimes by their probabilities, to 1e-9."""
+    """The innovation is the mixture over both regimes, to 1e-9."""
     filter_ = switching(0.1, 0.2)
     first, second = observations(2)
     filtered(filter_, [first])
@@ -136,7 +136,7 @@ def test_innovations_are_those_of_the_mixture():
 
 
 def test_regimes_are_counted():
-    """Four quiet steps, then two of a slug, again and again: of 4 quiet steps 1 is followed by a slug."""
+    """For a repeated sequence of four quiet steps and two slug steps, one of 4 quiet steps precedes a slug."""
     u = np.tile([0.0, 0.001, -0.001, 0.0, 0.2, 0.4], 12)[:-1]
     ratios = np.exp(u)[None, :, None] * np.ones((1, 1, 3))
     found = fit_inflow_prior(ratios, np.zeros((3, 2)), 0.005, quiet_threshold=0.02).regimes
@@ -147,7 +147,7 @@ def test_regimes_are_counted():
     assert found.share == pytest.approx(found.p_onset / (found.p_onset + found.p_end))
 
 
-def test_mistakes_are_told(tmp_path):
+def test_invalid_arguments_are_rejected(tmp_path):
     with pytest.raises(ValueError, match="prior must have regimes"):
         plain = replace(prior(0.1, 0.1), correlation=np.ones(1), regimes=None)
         SwitchingInflowFilter(task(), plain, LEVEL, 0.1, linearise_at_prediction(task()))
@@ -167,7 +167,7 @@ def particles(begins, ends, count=8):
 
 
 def test_particles_that_cover_all_sequences_are_exact():
-    """Three steps, 16 sequences of regimes: probability, mean and variance of exhaustive enumeration to 1e-9."""
+    """For three steps, 16 regime sequences, probability, mean and variance equal the enumeration to 1e-9."""
     measured = list(observations(3, slug=1.0))
     slug, mean, variance = enumerated(switching(0.1, 0.2), Regimes(0.1, 0.2, 1e-3), measured)
     ours = particles(0.1, 0.2)
@@ -183,7 +183,7 @@ def test_particles_that_cover_all_sequences_are_exact():
 
 
 def test_particles_of_one_regime_are_a_kalman_filter():
-    """Where a slug has always been and never ends: mean, variance and innovations to 1e-9."""
+    """For a slug that never ends, mean, variance and innovations equal the Kalman filter to 1e-9."""
     ours = particles(1.0, 1e-14, count=2)
     one = Filter(switching(1.0, 1e-14).filters[1].space)
     one.covariance = switching(1.0, 1e-14).filters[1].covariance
@@ -199,7 +199,7 @@ def test_particles_of_one_regime_are_a_kalman_filter():
     np.testing.assert_allclose(estimate.innovation_covariance, step.innovation_covariance, rtol=1e-9)
 
 
-def test_few_particles_are_nearer_to_enumeration_than_mixing():
+def test_few_particles_are_closer_to_enumeration_than_mixing():
     measured = list(observations(5))
     _, mean, variance = enumerated(switching(0.1, 0.2), Regimes(0.1, 0.2, 1e-3), measured)
     errors = [np.abs((filtered(filter_, measured)[1] - mean) / np.sqrt(variance)).max()
@@ -208,7 +208,7 @@ def test_few_particles_are_nearer_to_enumeration_than_mixing():
 
 
 def test_resampling_is_unbiased():
-    """Expected weights are the given ones, indices differ, and their number is kept."""
+    """Expected weights equal the arguments, indices are distinct, and their number is constant."""
     random = np.random.default_rng(3)
     weights = random.dirichlet(np.full(20, 0.3))
     total = np.zeros(20)
@@ -224,8 +224,8 @@ def test_resampling_is_unbiased():
 
 
 @pytest.mark.parametrize("make", [switching, particles], ids=["mixed", "particles"])
-def test_missing_readings_are_fewer_readings(make):
-    """NaN in place of a reading."""
+def test_missing_measurements_are_ignored(make):
+    """NaN measurements have no effect."""
     lost, fewer = make(0.1, 0.2), make(0.1, 0.2)
     keep = np.array([True, False, True, True])
     for seen in observations(3):

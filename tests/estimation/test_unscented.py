@@ -1,4 +1,4 @@
-"""Sigma points: exact where Kalman filters are, and for second-order moments of Gaussians."""
+"""Sigma points are exact for linear models and for second-order moments of Gaussians."""
 
 from types import SimpleNamespace
 
@@ -25,7 +25,7 @@ def states(model):
 
 
 def test_linear_voltages_are_the_kalman_filter():
-    """Mean, covariance, innovations and estimates to 1e-9."""
+    """Mean, covariance, innovations and estimates agree to 1e-9."""
     rng = np.random.default_rng(0)
     model = random_model(rng, N)
     table = rng.normal(size=(L, L, N))
@@ -44,7 +44,7 @@ def test_linear_voltages_are_the_kalman_filter():
 
 
 def test_moments_of_a_quadratic_function():
-    """Exact: mean, cross-covariance, and covariance where each axis bends the function alone."""
+    """Mean and cross-covariance are exact, and the covariance if the function has no mixed second derivatives."""
     rng = np.random.default_rng(1)
     constant, slope, bend = rng.normal(size=3), rng.normal(size=(3, 5)), rng.normal(size=(3, 5))
     offsets = 3.0**0.5 * np.concatenate([np.zeros((1, 5)), np.eye(5), -np.eye(5)])
@@ -55,8 +55,8 @@ def test_moments_of_a_quadratic_function():
 
 
 @pytest.mark.parametrize("std", [0.05, 0.3])
-def test_nearer_to_the_true_moments_than_linearising(std):
-    """Quadratic voltages of a log-normal concentration: predicted mean and covariance against 400,000 samples."""
+def test_closer_to_the_true_moments_than_linearisation(std):
+    """For quadratic voltages of a log-normal concentration, mean and covariance are compared with 400,000 samples."""
     rng = np.random.default_rng(2)
     n = 6
     seen = QuadraticModel(rng, n, L)

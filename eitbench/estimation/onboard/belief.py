@@ -44,8 +44,8 @@ class Belief:
         self._clear_cache()
         measuring, self._driving = observation["doubt"]
         self.fault_score = measuring + self._driving
-        """(L,) fraction of an electrode's recent measurements that were rejected, plus that of the
-        recent injections through it"""
+        """(L,) fraction of an electrode's recent measurements that were rejected, plus the fraction
+        of recent injections through it that failed"""
 
     @classmethod
     def from_prior(cls, rules: Rules) -> Belief:
@@ -151,8 +151,8 @@ class Belief:
         covariance; see `pair_design_criteria`.
 
         Electrodes that are not ``healthy`` contribute no measurement, and pairs with one of them
-        score 0. ``jacobian`` defaults to that of `linearisation`; ``weight`` defaults to present
-        errors in the scored region.
+        score 0. By default ``jacobian`` is `jacobian`, and ``weight`` is for present errors in the
+        scored region.
         """
         L = self.rules.pairs.max() + 1
         D = (self.jacobian if jacobian is None else jacobian).reshape(L * L, -1)

@@ -27,7 +27,7 @@ so that a table of few velocities serves the reduced filter."""
 
 
 class FullFilters:
-    """Filters of the built-in methods for B episodes, of the concentration relative to c_ref.
+    """Filters of the built-in methods for B episodes; the state is relative to c_ref.
 
     With a white inflow, voltages are linearised about c_ref of the first frame, and an unknown
     velocity is part of the state. With a learned inflow, they are linearised about each prediction.

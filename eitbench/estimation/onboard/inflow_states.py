@@ -1,10 +1,10 @@
-"""Reduced state space of a learned inflow: recent inflows, and what older ones leave in the pipe.
+"""Reduced state space with a learned inflow prior: recent inflows, and the response to older ones.
 
-The flow carries an inflow through the pipe (`steady_response`): c_t = c_bh (1 + Σ_k W_k u_{t−k}),
-with u = exp(E x) − 1 and x the Gaussian moments of the inflow's logarithm (`InflowPrior`). The last
-D values of x are part of the state, so that voltages are linearised about them at each step.
-What older inflows leave is a few coordinates a with a⁺ = A a + W_D u_{t−D}; A is fitted to the
-response. The exact filter (`InflowWindow`) keeps as many x as the pipe remembers.
+The concentration is the response to past inflows (`steady_response`): c_t = c_bh (1 + Σ_k W_k
+u_{t−k}), with u = exp(E x) − 1 and x the Gaussian variables of the inflow's logarithm
+(`InflowPrior`). The last D values of x are part of the state, so that voltages are linearised about
+them at each step. The response to older inflows has a few coordinates a with a⁺ = A a + W_D
+u_{t−D}; A is fitted. The state of the exact filter (`InflowWindow`) holds x over the full response.
 """
 
 from __future__ import annotations
@@ -27,22 +27,22 @@ if TYPE_CHECKING:
     from eitbench.worlds.world import World
 
 N_RECENT_INFLOWS = 8
-"""D; with fewer, more of the nonlinearity is linearised before anything is measured of it."""
+"""D; with a smaller value, more of the inflow is linearised before it is measured."""
 N_OLDER_COORDINATES = 48
-"""Coordinates of what older inflows leave."""
+"""Number of coordinates of the response to older inflows."""
 N_PRIOR_EPISODES = 200
-"""Training inflows from which the prior is learned, the first ones."""
+"""Number of training episodes (the first ones) for fitting the prior."""
 N_PRIOR_STEPS = 80
-"""Scored steps of these, whatever the world has: short records would not show how inflows last."""
+"""Scored steps of these episodes in all worlds: short episodes do not determine the correlation."""
 LEARNED_INFLOW_RANK = 100
-"""Coordinates of the concentration, including the `N_OLDER_COORDINATES` ones."""
+"""Number of coordinates of the concentration, including the `N_OLDER_COORDINATES`."""
 
 
 class InflowModel(NamedTuple):
-    """State (a, x_t, …, x_{t−D+1}) with s = h + D·r entries and the concentration that it means."""
+    """Model with state (a, x_t, …, x_{t−D+1}) of s = h + D·r entries."""
 
     basis: np.ndarray
-    """(n, q) orthonormal, of the concentration relative to the level, less 1"""
+    """(n, q) orthonormal basis of the concentration's relative deviation from c_ref"""
     transition: np.ndarray
     """(h, h) A"""
     weights: np.ndarray
@@ -52,7 +52,7 @@ class InflowModel(NamedTuple):
     regression: np.ndarray
     """(D,) weights of the last x in the mean of the next one"""
     remainder: np.ndarray
-    """() variance of what the regression leaves"""
+    """() variance of the residual of the regression"""
     initial: np.ndarray
     """(s, s) covariance at t = 0, about x = 0"""
 
@@ -73,7 +73,7 @@ def inflow_model(response: ImpulseResponse, prior: InflowPrior) -> InflowModel:
     weights = np.tensordot(directions.T, response.weights[:, :D + 1], 1)
     _, (regression, remainder) = yule_walker(prior.time_covariance(D + 1))
     r = prior.modes.shape[1]
-    by_x = np.zeros((older.shape[1] + D * r, K * r))                  # of the state by all past x
+    by_x = np.zeros((older.shape[1] + D * r, K * r))          # derivatives of the state by past x
     by_x[:older.shape[1], D * r:] = np.moveaxis(aged, 0, 1).reshape(older.shape[1], -1)
     by_x[older.shape[1]:, :D * r] = np.eye(D * r)
     history = by_x @ np.kron(root, np.eye(r))
@@ -83,15 +83,15 @@ def inflow_model(response: ImpulseResponse, prior: InflowPrior) -> InflowModel:
 
 @lru_cache(maxsize=4)
 def fit_world_prior(world: World) -> InflowPrior:
-    """Return the prior that training inflows of a world suggest."""
-    notify(f"learning the inflow prior of {world.name}, some seconds once a process")
+    """Return the prior fitted to training inflows of a world."""
+    notify(f"fitting the inflow prior of {world.name}, a few seconds once per process")
     longer = replace(world, schedule=replace(world.schedule, scored_steps=N_PRIOR_STEPS))
     return fit_prior_from_episodes(longer, SPLITS["train"][:N_PRIOR_EPISODES])
 
 
 def sample_coordinates(model: InflowModel, response: ImpulseResponse, prior: InflowPrior,
                        count: int) -> np.ndarray:
-    """Return coordinates (count, q) of concentrations that inflows drawn from the prior make."""
+    """Return coordinates (count, q) of concentrations for inflows sampled from the prior."""
     K = response.weights.shape[1]
     root = np.linalg.cholesky(toeplitz(prior.time_covariance(K)) + 1e-9 * np.eye(K))
     draws = np.random.default_rng(0).standard_normal((count, K, prior.modes.shape[1]))
@@ -101,17 +101,15 @@ def sample_coordinates(model: InflowModel, response: ImpulseResponse, prior: Inf
 
 
 def _directions(past: np.ndarray, root: np.ndarray) -> np.ndarray:
-    """(Q, …) directions in which inflows of this covariance in time, root·rootᵀ, move Σ_k past_k
-    x_{t−k} most, the strongest first."""
+    """Return the principal directions (Q, …) of Σ_k past_k x_{t−k}, in descending order, for
+    inflows with covariance root·rootᵀ in time."""
     moves = np.tensordot(past, root, (0, 0)).reshape(past.shape[1], -1)
     return np.linalg.svd(moves, full_matrices=False)[0]
 
 
 class InflowStates:
-    """State space of an `InflowModel` for B episodes side by side, in the precision of the model.
-
-    A `ReducedStates`.
-    """
+    """State space of an `InflowModel` for a batch of B episodes, in the precision of the model; a
+    `ReducedStates`."""
 
     def __init__(self, model: InflowModel) -> None:
         self.model = model
@@ -141,7 +139,7 @@ class InflowStates:
         return mean, moved
 
     def _move(self, entering: np.ndarray, rows: np.ndarray) -> np.ndarray:
-        """Return F·rows, (B, s, …), for the derivative F of the step; ``entering`` (B, h, r) are
+        """Return F·rows, (B, s, …), for the Jacobian F of the step; ``entering`` (B, h, r) holds
         the derivatives of a by the oldest x."""
         D, r = self._shape
         A = self.model.transition
@@ -183,7 +181,7 @@ class InflowStates:
         return mean
 
     def _window(self, mean: np.ndarray) -> np.ndarray:
-        """(B, D, r) the last x."""
+        """Return the last x (B, D, r)."""
         return mean[:, len(self.model.transition):].reshape(len(mean), *self._shape)
 
     def _inflow(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

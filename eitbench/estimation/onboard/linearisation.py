@@ -16,10 +16,9 @@ if TYPE_CHECKING:
     from eitbench.worlds.world import World
 
 C_REF_STEP = 0.02
-"""Step of the grid of ln c_ref: c_ref is rounded to 2 %, so that one linearisation serves many
-episodes."""
+"""Step of the grid of ln c_ref: c_ref is rounded to 2 %, so that episodes share linearisations."""
 C_REF_INDICES = np.arange(-50, 51)
-"""Grid indices, in steps from the expected concentration: 1/3 to 3 times as large."""
+"""Grid indices, in steps from the expected concentration: 1/3 to 3 times its value."""
 OUTLIER_SIGMA = 30.0
 """Largest residual of a measurement in the fit of c_ref, in standard deviations, if the instrument
 may be faulty."""
@@ -102,14 +101,14 @@ class LinearisationTable:
         averages[row * grid[0] + column, np.arange(len(points))] = nodal_mass
         if not averages.any(axis=1).all():
             raise ValueError(f"the task's mesh must have a node in each of {grid[0]} × {grid[1]} "
-                             "patches of the vessel")
+                             "boxes of the vessel")
         return averages / averages.sum(axis=1, keepdims=True)
 
     def noise_std(self, voltages: np.ndarray, noise_floor: float) -> np.ndarray:
         """Return the noise (V) that filters assume at predicted voltages (..., L).
 
-        It has a lower bound: voltages near zero may have almost no noise, and errors of the model
-        would then count as information.
+        It has a lower bound: voltages near zero may have almost no noise, and filters would then
+        fit model errors.
         """
         minimum = 1e-3 * np.abs(voltages).max(axis=-1, keepdims=True)
         return np.hypot(np.maximum(self.world.noise.std(voltages), minimum), noise_floor)
@@ -129,8 +128,8 @@ _table = lru_cache(maxsize=2)(LinearisationTable)
 
 
 def linearisation_table(world: World) -> LinearisationTable:
-    """Return the table of a world, built once a process for all worlds that differ in faults
-    only."""
+    """Return the table of a world, built once per process for all worlds that differ only in
+    faults."""
     return _table(world.fault_free)
 
 

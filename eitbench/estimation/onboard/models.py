@@ -1,4 +1,4 @@
-"""Reduced models of worlds: shipped, kept in the cache, or made."""
+"""Reduced models of worlds: bundled, cached or built."""
 
 from __future__ import annotations
 
@@ -52,15 +52,15 @@ if TYPE_CHECKING:
 WHITE_INFLOW_RANK = 120
 """Coordinates of the concentration with a white inflow."""
 WHITE_MODEL_VERSION = 1
-"""Version of the models with a white inflow that are kept."""
+"""Version of stored models with a white inflow."""
 LEARNED_MODEL_VERSION = 1
-"""Version of the models with a learned inflow that are kept."""
+"""Version of stored models with a learned inflow."""
 N_TABULATED_VELOCITIES = 16
 """Velocities within the bounds, evenly spaced, for which the joint model is computed."""
 BASIS_VELOCITIES = (0.6, 1.0, 1.4)
-"""Velocities, relative to the nominal one, at which the basis of the joint model is learned."""
+"""Velocities, relative to the nominal one, for computing the basis of the joint model."""
 N_SAMPLES = 500
-"""Concentrations by which the nodes of the voltages are chosen."""
+"""Number of sample concentrations for choosing the nodes of `NodeVoltages`."""
 COVARIANCE_ARRAYS = ("noise", "initial")
 """Arrays of a model that are covariances: one triangle is stored."""
 FLOAT64_ARRAYS = ("velocities",)
@@ -113,13 +113,13 @@ def _learned(world: World, part: str) -> dict[str, np.ndarray]:
 
 
 def load_or_build_model(world: World) -> ReducedModel | JointModel:
-    """Return the reduced model with a white inflow; making it takes half a minute. Its numbers are
-    rounded to single precision."""
+    """Return the reduced model with a white inflow, rounded to single precision; building it takes
+    half a minute."""
     key = reduced_model_key(world)
 
     def build() -> dict[str, np.ndarray]:
-        notify(f"making the reduced filter of {world.name}, about half a minute; it is kept in "
-            f"{key.path.parent}")
+        notify(f"building the reduced filter of {world.name}, about half a minute; it is cached in "
+               f"{key.path.parent}")
         return build_packed_model(world)
 
     kind = ReducedModel if world.velocity_model is None else JointModel
@@ -137,7 +137,7 @@ def reduced_model_key(world: World) -> Key:
 
 
 def build_packed_model(world: World) -> dict[str, np.ndarray]:
-    """Make a model on one thread, whose number changes rounding, and return it as it is stored."""
+    """Build a model on one thread, for reproducible rounding, and return its stored form."""
     make: Callable[[World], Any] = (build_steady_model if world.velocity_model is None
                                     else build_joint_model)
     with threadpool_limits(1):
@@ -145,7 +145,7 @@ def build_packed_model(world: World) -> dict[str, np.ndarray]:
 
 
 def pack_model(model: NamedTuple) -> dict[str, np.ndarray]:
-    """Return the arrays of a model with a ``basis`` (n, r) as they are stored."""
+    """Return the stored form of a model with a ``basis`` (n, r)."""
     arrays: dict[str, np.ndarray] = {}
     for name, array in model._asdict().items():
         if name in COVARIANCE_ARRAYS:
@@ -156,7 +156,7 @@ def pack_model(model: NamedTuple) -> dict[str, np.ndarray]:
 
 
 def unpack_model(arrays: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Return the arrays of a model in double precision, from those that `pack_model` returned."""
+    """Return the arrays of a model in double precision, from the result of `pack_model`."""
     rank = arrays["basis"].shape[1]
     rows, columns = np.triu_indices(rank)
     model = {name: array.astype(float) for name, array in arrays.items()}
@@ -177,7 +177,7 @@ def build_steady_model(world: World) -> ReducedModel:
 
 
 def build_joint_model(world: World) -> JointModel:
-    """Return the model of an unknown mean velocity in double precision, in some 45 s."""
+    """Return the model of an unknown mean velocity in double precision, in about 45 s."""
     task = make_task(world)
     flow = require_scalar_velocity(task)
     prior = task.prior
@@ -187,7 +187,7 @@ def build_joint_model(world: World) -> JointModel:
     nodal = task.evolution.state_noise_covariance(0.0, prior.nodal_std**2)
 
     def step(part: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """F, Y and Γ_w at a velocity; of the noise the nodal part stays what it is at first, as in
+        """Return F, Y and Γ_w at a velocity; the nodal part of the noise is constant, as in
         `VelocityStates`."""
         F, Y = task.transport_at(np.array([part * flow.nominal[0]])).transition()
         return F, Y, prior.inflow_std**2 * (Y @ Y.T) + nodal
@@ -213,7 +213,7 @@ def require_scalar_velocity(task: Task) -> VelocityModel:
 
 
 def _random_pair_measurements(world: World, length: int) -> list[LinearMeasurement]:
-    """Return observations of random pairs, about the expected level and relative to it."""
+    """Return measurements of random pairs, linearised about and relative to the expected c_ref."""
     task = make_task(world)
     every = pair_currents(world)
     level = world.expected_concentration

@@ -11,12 +11,11 @@ from eitbench.estimation.quadratic_voltages import ScaledVoltageModel, TransferR
 from eitbench.estimation.reduced import matvec
 
 N_LOG_MODES = 80
-"""Number of modes of the logarithms; voltages then differ by 0.05 standard deviations of the
-noise."""
+"""Number of modes of the logarithms, for a voltage error of 0.05 noise standard deviations."""
 N_QUADRATIC_MODES = 24
-"""Number of the first modes, in which voltages are quadratic."""
+"""Number of leading modes in which voltages are quadratic."""
 MIN_RELATIVE_CONCENTRATION = 0.05
-"""Relative to the level; smaller concentrations count as this one when modes are computed."""
+"""Lower bound of concentrations relative to c_ref when modes are computed."""
 
 
 class NodeVoltages(NamedTuple):
@@ -25,13 +24,13 @@ class NodeVoltages(NamedTuple):
     level: np.ndarray
     """() c_0 in mol/m³"""
     smallest: np.ndarray
-    """() mol/m³, as which what is below counts"""
+    """() mol/m³, lower bound to which smaller concentrations are raised"""
     basis: np.ndarray
-    """(m, q) of the concentration relative to the episode's level, at the nodes"""
+    """(m, q) basis of the concentration relative to the episode's c_ref, at the nodes"""
     average: np.ndarray
     """(m,) weights of the mean of u = ln(c/c_0) over the vessel"""
     to_modes: np.ndarray
-    """(k, m) modes in which voltages are quadratic, by u at the nodes"""
+    """(k, m) map from u at the nodes to the modes in which voltages are quadratic"""
     resistance: np.ndarray
     """(L, L) at c_0, Ω (Ω·m in 2D)"""
     slope: np.ndarray
@@ -42,8 +41,8 @@ class NodeVoltages(NamedTuple):
     def linearise(self, levels: np.ndarray, coordinates: np.ndarray,
                   currents: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return voltages (B, L) in V, and their derivatives (B, L, q) by the coordinates, of
-        episodes with ``levels`` (B,) in mol/m³, ``coordinates`` (B, q) and ``currents`` (B, L).
-        One level with its coordinates may serve several currents."""
+        episodes with c_ref ``levels`` (B,) in mol/m³, ``coordinates`` (B, q) and ``currents``
+        (B, L). One level with its coordinates may be combined with several currents."""
         relative = 1.0 + matvec(self.basis, coordinates)
         relative = np.maximum(relative, (self.smallest / levels)[:, None])
         u = np.log(relative) + np.log(levels / self.level)[:, None]
@@ -64,8 +63,8 @@ def node_voltages(model: TransferResistanceModel, level: float, basis: np.ndarra
                   samples: np.ndarray) -> NodeVoltages:
     """Return the voltages of concentrations level·(1 + basis·y), such as ``samples`` (N, q) of y.
 
-    Twice as many nodes as modes determine the samples' logarithms at all nodes by least squares
-    (discrete empirical interpolation; Chaturantabut and Sorensen 2010).
+    The logarithms at all nodes are interpolated by least squares from two nodes per mode (discrete
+    empirical interpolation; Chaturantabut and Sorensen 2010).
     """
     logarithms = np.log(np.maximum(1.0 + samples @ basis.T, MIN_RELATIVE_CONCENTRATION))
     logarithms -= logarithms.mean(axis=1, keepdims=True)

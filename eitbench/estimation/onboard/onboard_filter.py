@@ -1,4 +1,4 @@
-"""The filter inside an injection environment, and what an agent is shown of it."""
+"""Filter inside an injection environment, and its features for the observation."""
 
 from __future__ import annotations
 
@@ -14,58 +14,57 @@ if TYPE_CHECKING:
     from eitbench.estimation.onboard.rules import Rules
 
 ESTIMATOR_OPTIONS = ("reduced", "full", "none")
-"""Names: reduced filter for training, exact filter for scores, or no filter."""
+"""Reduced filter for training, exact filter for scores, or no filter."""
 FAULT_EMA_WEIGHT = 0.2
-"""Weight of the last injection in the running share of readings that were rejected."""
+"""Weight of the last injection in the moving average of the fraction of rejected measurements."""
 
 
 class EpisodeFilters(Protocol):
-    """Filters of B episodes, which start from t = 0 in the level of the first frame."""
+    """Filters of B episodes, which start at t = 0 with c_ref of the first frame."""
 
     c_ref: np.ndarray
     """(B,) ĉ_bh in mol/m³"""
 
     def __init__(self, rules: Rules, frames: np.ndarray) -> None:
-        """Take in the first frame, voltages (B, K, L) in V of the world's cycle."""
+        """Assimilate the first frame, voltages (B, K, L) in V of the world's cycle."""
 
     def assimilate(self, voltages: np.ndarray,
                    currents: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Predict and condition on voltages (B, L) in V for currents (B, L), all zero where nothing
-        was injected; return the innovations in predicted standard deviations and which readings
-        were accepted, both (B, L)."""
+        """Predict and condition on voltages (B, L) in V for currents (B, L), all zero without an
+        injection; return the innovations in predicted standard deviations and the mask of accepted
+        measurements, both (B, L)."""
 
     def innovations(self) -> list[Innovation | None]:
-        """Return the last innovation of each episode, for scores; None where nothing was injected,
-        or no reading was accepted."""
+        """Return the last innovation of each episode, for scores; None without an injection or an
+        accepted measurement."""
 
     def coarse_grid(self) -> tuple[np.ndarray, np.ndarray]:
         """Return mean and standard deviation (B, patches) in mol/m³ on the coarse grid."""
 
     def errors(self, moments: np.ndarray, deviations: np.ndarray,
                squares: np.ndarray) -> np.ndarray:
-        """Return relative errors (5.12) of the present means, from what `project` makes of recorded
-        moments (B, …)."""
+        """Return relative errors (5.12) of the present means, from moments (B, …) after `project`.
+        """
 
     def means(self) -> np.ndarray:
         """Return estimates (B, n) in mol/m³ on the task's mesh."""
 
     def stds(self) -> np.ndarray:
-        """Return their standard deviations (B, n) in mol/m³."""
+        """Return standard deviations (B, n) of the estimates in mol/m³."""
 
     def velocity(self) -> tuple[np.ndarray, np.ndarray] | None:
-        """Return velocity parameters θ and their standard deviations (B, k) in m/s, None where the
-        flow is known."""
+        """Return velocity parameters θ and their standard deviations (B, k) in m/s; None if the
+        task specifies the velocity."""
 
     @staticmethod
     def project(rules: Rules, moment: np.ndarray) -> np.ndarray:
-        """Return moments over what counts (T, n), `eitbench.data.episode_cache.ScoreIntegrals`,
-        as `errors`
-        wants them."""
+        """Return moments (T, n) over the scored region in the form for `errors`; see
+        `eitbench.data.episode_cache.ScoreIntegrals`."""
 
 
 def filters_class(rules: Rules, estimator: str) -> type[EpisodeFilters] | None:
-    """Return the filters of this name, None for "none"; ``ValueError`` if there are none under
-    these rules."""
+    """Return the class for a name, None for "none"; ``ValueError`` if it does not exist for these
+    rules."""
     if estimator not in ESTIMATOR_OPTIONS:
         raise ValueError(f"estimator must be one of {', '.join(ESTIMATOR_OPTIONS)}, "
                          f"got {estimator!r}")
@@ -73,16 +72,16 @@ def filters_class(rules: Rules, estimator: str) -> type[EpisodeFilters] | None:
         return None
     if rules.inflow == "learned":
         if not hasattr(rules.world.target, "draw_inflow"):
-            raise ValueError("inflow must be 'white' where nothing flows in, got 'learned' and a "
-                             f"target {type(rules.world.target).__name__}")
+            raise ValueError("inflow must be 'white' for a target without inflow, got 'learned' "
+                             f"and a target {type(rules.world.target).__name__}")
         if rules.world.velocity_model is not None:
-            raise ValueError("inflow must be 'white' where the flow is to be estimated too, "
+            raise ValueError("inflow must be 'white' where the velocity is estimated too, "
                              f"got {rules.inflow!r}")
     return ReducedFilters if estimator == "reduced" else FullFilters
 
 
 class OnboardFilter:
-    """Filters of B episodes with their last innovations and the doubts about electrodes.
+    """Filters of B episodes with their last innovations and the fault scores of electrodes.
 
     Parameters
     ----------
@@ -99,22 +98,22 @@ class OnboardFilter:
         self._doubt = np.zeros((B, 2, L))
 
     def assimilate(self, voltages: np.ndarray, currents: np.ndarray) -> None:
-        """Take in one time step with voltages (B, L) in V for currents (B, L) in A (A/m in 2D)."""
+        """Assimilate voltages (B, L) in V of one step, for currents (B, L) in A (A/m in 2D)."""
         self._innovations, accepted = self.filters.assimilate(voltages, currents)
-        # Of each electrode: how often lately its own reading was rejected, and the injections that
-        # it drove.
+        # Recent fraction per electrode of rejected measurements, and of failed injections through
+        # it.
         reading = self._doubt[:, 0]
         driving = self._doubt[:, 1]
         injected = currents.any(axis=1, keepdims=True)
         drives = currents != 0.0
         failed = ~accepted.any(axis=1, keepdims=True)
-        # A failed injection has no information on the electrodes that only measured.
+        # A failed injection has no information on the measuring electrodes.
         reading += FAULT_EMA_WEIGHT * (injected & ~failed) * (~accepted - reading)
         driving += FAULT_EMA_WEIGHT * drives * (failed - driving)
 
     def features(self) -> dict[str, np.ndarray]:
-        """Return arrays (B, …): innovations, mean, std, doubt, and where the flow is estimated its
-        velocity and the standard deviation of that."""
+        """Return arrays (B, …): innovations, mean, std, doubt (fault scores), and if the velocity
+        is estimated, its mean and standard deviation."""
         mean, std = self.filters.coarse_grid()
         shown = {"innovations": self._innovations.copy(), "mean": mean, "std": std,
                  "doubt": self._doubt.copy()}

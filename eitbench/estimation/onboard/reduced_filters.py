@@ -1,4 +1,4 @@
-"""Reduced filters of the episodes of an injection environment, side by side: for training."""
+"""Reduced filters for batches of episodes of an injection environment, for training."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 
 class ReducedFilters:
-    """Filters of B episodes in few coordinates and single precision. See `EpisodeFilters`."""
+    """Reduced filters of B episodes in single precision. See `EpisodeFilters`."""
 
     def __init__(self, rules: Rules, frames: np.ndarray) -> None:
         self._rules = rules
@@ -104,7 +104,7 @@ class ReducedFilters:
     def project(rules: Rules, moment: np.ndarray) -> np.ndarray:
         return np.asarray(moment @ SharedData.of(rules).basis)
 
-    # Of the first episode, in double precision, for `Belief`:
+    # The following members refer to the first episode, in double precision, for `Belief`.
 
     @property
     def state(self) -> np.ndarray:
@@ -117,8 +117,8 @@ class ReducedFilters:
         return self._filter.covariance[0].astype(float)
 
     def linearisation(self, state: np.ndarray) -> Linearisation:
-        """Return 𝓡 and its derivatives (L, L, s), as the filter linearises at a predicted mean
-        (s,)."""
+        """Return the filter's linearisation of 𝓡, derivatives (L, L, s), at a predicted mean (s,).
+        """
         states = self._shared.states
         about = self._shared.voltages.about(self._indices[0], states.coordinates(state[None])[0])
         return about._replace(jacobian=self._by_state(state, about.jacobian))
@@ -126,7 +126,7 @@ class ReducedFilters:
     def relinearised_jacobian(self) -> np.ndarray:
         """Return the derivatives (L, L, s) of 𝓡 about the present estimate, computed exactly."""
         level = self.c_ref[0]
-        positive = np.maximum(self.means()[0], 0.1 * level)              # a conductivity is
+        positive = np.maximum(self.means()[0], 0.1 * level)
         _, table = self._shared.levels.task.observation.resistance_derivatives(positive)
         by_coordinates = level * np.tensordot(table, self._shared.states.basis, axes=(0, 0))
         return self._by_state(self.state, by_coordinates)
@@ -140,14 +140,14 @@ class ReducedFilters:
 
     def weight(self, state: np.ndarray) -> np.ndarray:
         """Return W (s, s) at a mean (s,): tr(W P) is the expected squared error, integrated over
-        the region that is scored, relative to the square of the level."""
+        the scored region, relative to c_ref²."""
         half = self._by_state(state, self._shared.weight[None])[0]
         return self._by_state(state, half.T[None])[0]
 
     def steps(self, count: int,
               along: np.ndarray | None = None) -> list[tuple[np.ndarray, ...]]:
-        """Return for each of the next ``count`` steps the derivative, the covariance of the noise,
-        (s, s) each, and the mean (s,) after it; at the predicted means, or at the states
+        """Return for each of the next ``count`` steps the Jacobian, the noise covariance, (s, s)
+        each, and the mean (s,) after it, linearised at the predicted means, or at the states
         ``along`` (count, s) before each step."""
         mean = self.state
         made: list[tuple[np.ndarray, ...]] = []
@@ -158,15 +158,15 @@ class ReducedFilters:
         return made
 
     def true_states(self, entries: np.ndarray) -> np.ndarray:
-        """Return the true states (T, s) of the first episode from its recording, for bounds.
-        ``ValueError`` with a learned inflow: a recording does not hold the inflow."""
+        """Return the true states (T, s) of the first episode from its cached data, for oracles.
+        ``ValueError`` with a learned inflow, which the cached data do not include."""
         if self._rules.inflow == "learned":
-            raise ValueError("world must have a flow that is to be estimated; where it is known "
-                             "the truth hardly changes what an injection tells")
+            raise ValueError("inflow must be 'white' for true states, got 'learned': the cached "
+                             "episode does not include the inflow")
         world = self._rules.world
         level = self.c_ref[0]
         mass = scoring_constants(world).mass
-        whole = 0.5 * (mass.sum(axis=0) + mass.sum(axis=1))  # ∫ of each node's function
+        whole = 0.5 * (mass.sum(axis=0) + mass.sum(axis=1))  # ∫ of each basis function
         beyond = (world.background - level) * whole + entries["moment"]
         states = beyond @ self._shared.states.basis / level
         flow = self._shared.levels.task.velocity
@@ -177,7 +177,7 @@ class ReducedFilters:
 
 
 class VoltagesAboutReference:
-    """Voltages linearised about the level of each episode, in single precision."""
+    """Voltages linearised about c_ref of each episode, in single precision."""
 
     def __init__(self, levels: LinearisationTable, basis: np.ndarray) -> None:
         self._levels = levels
@@ -191,7 +191,7 @@ class VoltagesAboutReference:
     def linearise(self, indices: list[int], coordinates: np.ndarray,
                   currents: np.ndarray) -> tuple[np.ndarray, ...]:
         """Return voltages (B, L) in V, derivatives (B, L, q) by the coordinates, and the
-        coordinates (B, q) about which they are linearised."""
+        coordinates (B, q) of the linearisation point."""
         levels = [self._level(index) for index in indices]
         resistance = np.array([level.resistance for level in levels])
         computed = (currents[:, None] @ resistance)[:, 0]
@@ -200,7 +200,7 @@ class VoltagesAboutReference:
         return computed, matrix, np.zeros_like(coordinates)
 
     def about(self, index: int, coordinates: np.ndarray) -> Linearisation:
-        """Return 𝓡 and its derivatives (L, L, q) as linearised for these coordinates (q,)."""
+        """Return the linearisation of 𝓡, derivatives (L, L, q), at these coordinates (q,)."""
         level = self._level(index)
         return level._replace(jacobian=level.jacobian.astype(float))
 
@@ -221,7 +221,7 @@ class VoltagesAboutPrediction:
 
     def about(self, index: int, coordinates: np.ndarray) -> Linearisation:
         L = len(self._voltages.resistance)
-        each = np.eye(L) - 1.0 / L                      # a potential that all share does not count
+        each = np.eye(L) - 1.0 / L                      # currents must sum to zero
         level = self._levels.c_ref(index)
         return Linearisation(
             *self._voltages.linearise(np.array([level]), coordinates[None], each))
@@ -244,7 +244,7 @@ class SharedData:
         self.basis = with_level
         self.weight = self.mass[1:, 1:]
         if world.region is None and inflow == "white":
-            # Φᵀ M Φ = I but for the single precision in which Φ is stored, which would break ties.
+            # Φᵀ M Φ = I up to the rounding of the stored Φ, which would break ties.
             self.weight = np.eye(len(self.weight))
         self.patches = (self.levels.grid_averages @ basis).astype(np.float32)
 
@@ -257,7 +257,7 @@ class SharedData:
 
     @staticmethod
     def of(rules: Rules) -> SharedData:
-        """Return the cached object of a world and an inflow."""
+        """Return the cached object for the rules' world and inflow."""
         return _shared(rules.world.fault_free, rules.inflow)
 
 

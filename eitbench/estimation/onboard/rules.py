@@ -1,4 +1,4 @@
-"""Rules: what may be injected in a world, and with which instrument; what every policy is told."""
+"""Rules of an injection environment: admissible currents, instrument and estimator settings."""
 
 from __future__ import annotations
 
@@ -16,29 +16,29 @@ if TYPE_CHECKING:
     from eitbench.worlds.world import World
 
 INFLOW_MODELS = ("white", "learned")
-"""What may be believed of the inflow: white noise (Table 5.1), or its logarithm as coloured as in
+"""Inflow priors of the estimator: white noise (Table 5.1), or a coloured logarithm fitted to
 training episodes (``docs/methods.md``, 10)."""
 
 
 @dataclass(frozen=True)
 class Rules:
-    """What may be injected, by whom the outcome is estimated, and with which instrument.
+    """Rules of an injection environment, shared with every policy.
 
     Parameters
     ----------
     world : World
-        Its instrument's ``limit`` says whether an action is the number of an electrode pair (None),
-        or L currents in parts of the instrument's. These are first cut to ±1, the bounds of the
-        action space; then their mean is taken away, and they are scaled down to the norm of a pair
-        if they exceed it. Its schedule's ``budget`` says how many injections the agent may make in
-        an episode, where it may also inject nothing.
+        Its instrument's ``current_norm`` selects the actions: numbers of electrode pairs (None), or
+        L currents relative to the instrument's amplitude. These are clipped to ±1, the bounds of
+        the action space, centred, and scaled down to the norm of a pair if they exceed it. Its
+        schedule's ``budget`` limits the injections of an episode; the agent may then also inject
+        nothing.
     gate : float
-        The estimator leaves out readings further from the prediction than this many standard
-        deviations.
+        Innovation gate of the estimator: larger deviations, in predicted standard deviations, are
+        rejected.
     has_first_frame : bool
-        Whether the first frame is measured before the agent's first injection.
+        True if the first frame is measured before the agent's first injection.
     inflow : "white" or "learned"
-        What the estimator believes of the inflow: Table 5.1, or what training episodes show.
+        Inflow prior of the estimator: Table 5.1, or fitted to training episodes.
     """
 
     world: World
@@ -55,7 +55,7 @@ class Rules:
 
     @property
     def instrument(self) -> Instrument:
-        """The world's."""
+        """Instrument of the world."""
         return self.world.instrument
 
     @property
@@ -75,13 +75,12 @@ class Rules:
 
     @property
     def amplitude(self) -> float:
-        """A (A/m in 2D); of a pair's current."""
+        """Current of a pair in A (A/m in 2D)."""
         return float(np.abs(self.world.currents).max())
 
     @property
     def action_currents(self) -> np.ndarray:
-        """(actions, L) currents of each numbered action; the last is no current, where there is a
-        budget."""
+        """(actions, L) currents of each numbered action; with a budget, the last row is zero."""
         pairs = pair_currents(self.world)
         if self.budget is None:
             return pairs
@@ -95,30 +94,26 @@ class Rules:
 
     @property
     def tuning_key(self) -> str:
-        """What was found by search is kept under: the world's name, and whether there are faults or
-        a budget."""
+        """Key of tuned values: the world's name, with suffixes for faults and a budget."""
         faults = " with faults" * (self.instrument.max_faulty > 0)
         budget = " with a budget" * (self.budget is not None)
         return self.world.name + faults + budget
 
     def action(self, pair: int | None) -> Any:
-        """The action that injects the pair of this number, or nothing (None, which needs a budget
-        or currents)."""
+        """Return the action that injects through the pair of this number, or nothing (None, which
+        requires a budget or current actions)."""
         if self.limit is not None:
             currents = np.zeros(self.world.currents.shape[1], dtype=np.float32)
             if pair is not None:
                 currents[self.pairs[pair]] = 1.0, -1.0
             return currents
         if pair is None and self.budget is None:
-            raise ValueError("pair must be a number: in a world without a budget each step injects")
+            raise ValueError("pair must be a number in a world without a budget, got None")
         return len(self.pairs) if pair is None else int(pair)
 
     def is_injection_step(self, left: np.ndarray) -> bool:
-        """Whether a budget that is spread evenly is spent at this step; ``left`` as observed.
-        Always without a budget.
-
-        The first injection comes at the end of its interval.
-        """
+        """Return whether a uniformly distributed budget has an injection at this step, at the end
+        of each interval; always True without a budget. ``left`` is the observation's entry."""
         if self.budget is None:
             return True
         steps = self.world.n_steps - self.has_first_frame * len(self.world.currents)
@@ -126,8 +121,8 @@ class Rules:
         return (k + 1) * self.budget // steps > k * self.budget // steps
 
     def currents(self, actions: np.ndarray) -> np.ndarray:
-        """(B, L) currents in A (A/m in 2D) of actions (B,) or (B, L); entries of the latter beyond
-        ±1 are first taken for ±1."""
+        """Return currents (B, L) in A (A/m in 2D) of actions (B,), or (B, L), which are clipped to
+        ±1."""
         if self.limit is None:
             return self.action_currents[actions]
         free = np.clip(np.asarray(actions, dtype=float), -1.0, 1.0)
