@@ -28,10 +28,10 @@ def test_our_baselines_load():
 @pytest.mark.parametrize(("source", "message"), [
     ("x = 1", "must define a class Estimator with a method update"),
     ("class Estimator: pass", "Estimator must have a method update"),
-    ("class Estimator:\n  boards = ('filer',)\n  def update(self, V, I): pass", "boards must be some of filter"),
-    ("class Estimator:\n  boards = ()\n  def update(self, V, I): pass", "boards must be some of filter"),
-    ("class Estimator:\n  boards = 'filter'\n  def update(self, V, I): pass", "boards must be some of filter"),
-    ("class Estimator:\n  role = 'flor'\n  def update(self, V, I): pass", "role must be None, 'floor' or 'reference'"),
+    ("class Estimator:\n  boards = ('filer',)\n  def update(self, V, I): pass", "subtracks must be some of filter"),
+    ("class Estimator:\n  boards = ()\n  def update(self, V, I): pass", "subtracks must be some of filter"),
+    ("class Estimator:\n  boards = 'filter'\n  def update(self, V, I): pass", "subtracks must be some of filter"),
+    ("class Estimator:\n  role = 'flor'\n  def update(self, V, I): pass", "role must be among None, 'floor'"),
     ("class Estimator:\n  parameters = {'a': {1}}\n  def update(self, V, I): pass", "fit for JSON"),
     ("class Estimator:\n  parameters = {'a': 'b' * 10_000}\n  def update(self, V, I): pass", "at most 10000 bytes"),
     ("class Estimator:\n  parameters = {'a': 10**400}\n  def update(self, V, I): pass", "fit for JSON"),
@@ -98,5 +98,5 @@ def test_only_registered_names_are_ours(track, tmp_path, monkeypatch):
     link = tmp_path / f"{ours}.py"
     link.symlink_to(path)
     assert not is_builtin(str(link))
-    with pytest.raises(ValueError, match="has the name of one of ours"):
+    with pytest.raises(ValueError, match="has the name of a built-in method"):
         load_method(str(link), track)

@@ -436,7 +436,7 @@ def test_a_worker_does_not_choose_its_name(tmp_path):
     path.write_text(path.read_text() + "\nimport eitbench.bench.methods as b\nmade = b.Method\n"
                     "b.Method = lambda track, name, *rest: made(track, 'homogeneous', *rest)\n")
     assert Job(FILTER, str(path), 1, "process").load().name == "mine"
-    with pytest.raises(ValueError, match="has the name of one of ours"):
+    with pytest.raises(ValueError, match="has the name of a built-in method"):
         Job(FILTER, write_baseline(tmp_path, "homogeneous"), 1, "process").load()
 
 

@@ -55,7 +55,7 @@ def test_its_policy_is_the_one_that_is_scored():
 
 @pytest.mark.parametrize(("given", "said"), [
     ({"name": "a b"}, "out must be the name of a Minari data set"),
-    ({"env": "eitbench/Pipe2D-v0"}, "does not ask for injections"),
+    ({"env": "eitbench/Pipe2D-v0"}, "is not of the track injection"),
     ({"policy": "nobody"}, "nobody"),
     ({"seeds": "200003"}, "must name the split of test episodes"),
 ])

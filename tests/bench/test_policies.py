@@ -262,12 +262,12 @@ def test_wrong_names_are_named(tmp_path):
         load_method(write_policy(tmp_path, "x = 1"), "injection")
     with pytest.raises(ValueError, match=r"policy must be the path of .*, or one of adjacent, .*; got 'lucky'"):
         load_method("lucky", "injection")
-    with pytest.raises(ValueError, match="has the name of one of ours"):
+    with pytest.raises(ValueError, match="has the name of a built-in method"):
         load_method(write_policy(tmp_path, name="adjacent"), "injection")
     (tmp_path / "greedy_a.zip").write_bytes(b"PK")
-    with pytest.raises(ValueError, match=r"greedy_a\.zip has the name of one of ours"):
+    with pytest.raises(ValueError, match=r"greedy_a\.zip has the name of a built-in method"):
         load_method(str(tmp_path / "greedy_a.zip"), "injection")
-    with pytest.raises(ValueError, match="environment eitbench/Pipe2D-v0 does not ask for injections"):
+    with pytest.raises(ValueError, match="environment eitbench/Pipe2D-v0 is not of the track injection"):
         injected("eitbench/Pipe2D-v0", {}, "adjacent", 1)
     with pytest.raises(ValueError, match="estimator must be one of full, reduced, got 'none'"):
         injected(NAME, SHORT, "adjacent", 1, "none")

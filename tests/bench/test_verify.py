@@ -163,7 +163,7 @@ def test_another_file_does_not_run(mine, tmp_path):
     link = tmp_path / "link" / "mine.py"
     link.parent.mkdir()
     link.symlink_to(methods.find_method("homogeneous", "estimation"))
-    with pytest.raises(ValueError, match="is a built-in method, but not mine"):
+    with pytest.raises(ValueError, match="must be the method of the record, mine, got another built-in"):
         verification.job_for_record(read_record(path), str(link))
 
 

@@ -242,7 +242,7 @@ def test_same_command_resumes(tmp_path):
     assert run_mine()[0] == 0
     before = sorted(path.stat().st_mtime_ns for path in (tmp_path / "results" / "episodes").rglob("*.json"))
     _, said, complaint = run_mine()
-    assert "2 of 2 episodes are already there" in said + complaint
+    assert "2 of 2 episodes are already stored" in said + complaint
     run_mine("--seeds", "dev:0-2")
     after = sorted(path.stat().st_mtime_ns for path in (tmp_path / "results" / "episodes").rglob("*.json"))
     assert len(before) == 2 and len(after) == 3 and after[:2] == before
