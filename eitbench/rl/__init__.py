@@ -1,1 +1,1 @@
-"""Floor 8: learning to choose injections (extra ``rl``)."""
+"""Training of injection policies by reinforcement learning (layer 8; extra ``rl``)."""

@@ -1,4 +1,4 @@
-"""Trained agents as policies, from the folder that `eitbench train` writes."""
+"""Trained agents as policies, loaded from the folder that `eitbench train` writes."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ from eitbench.estimation.onboard.rules import Rules
 
 
 class Agent:
-    """A policy with the deterministic actions of a stable-baselines3 model, which subclasses set.
+    """Policy with the deterministic actions of a stable-baselines3 model, which subclasses set.
 
-    The agent observes the reduced filter with which it was trained, whichever filter the
-    environment has, so its injections do not depend on that filter.
+    The agent's observations come from the reduced filter with which it was trained, so its
+    injections do not depend on the filter of the environment.
     """
 
     model: ClassVar[Any]
@@ -29,7 +29,7 @@ class Agent:
 
     @classmethod
     def suits(cls, rules: Rules) -> bool:
-        """Return whether spaces have the shapes with which the model was trained."""
+        """Return whether spaces have the same shapes as in training."""
         core = InjectionCore(rules, "reduced", "scaled")
         return bool(cls.model.action_space == core.action_space
                     and cls.model.observation_space.shape == core.observation_space.shape)
@@ -62,9 +62,9 @@ def load_agent(path: Path, content: bytes) -> tuple[str, str, type[Agent], dict[
     """Return name, title, policy and parameters of the model.zip at ``path`` with this ``content``.
 
     The name is ALGO_seedK for built-in agents, and ALGO_HASH_seedK, with a hash of the
-    configuration, for all others. Loading a model executes code, so the folder must hold its
-    ``sha256``, and a file with another digest is not loaded. ``ValueError`` if it differs, or if
-    ``config.json`` or ``sha256`` is missing.
+    configuration, for all others. Loading a model executes code, so its digest is first compared
+    with ``sha256`` in the folder. ``ValueError`` if it differs, or if ``config.json`` or ``sha256``
+    is missing.
     """
     try:
         asked = json.loads((path.parent / "config.json").read_text())
@@ -82,7 +82,7 @@ def load_agent(path: Path, content: bytes) -> tuple[str, str, type[Agent], dict[
     policy = type("Policy", (Agent,), {"model": model,
                                        "uses_action_masks": algo.startswith("maskable")})
     built_in = (baseline_folder() / "checkpoints" / asked["env"].replace("/", "-") / algo
-                / f"seed{seed}" / "sha256")             # a copy elsewhere is built-in too
+                / f"seed{seed}" / "sha256")             # a copy of it is built-in too
     is_built_in = built_in.is_file() and built_in.read_text().split()[:1] == [found]
     mark = "" if is_built_in else f"_{configuration_hash(asked)}"
     parameters = {"env": asked["env"], **asked["config"]}
@@ -90,6 +90,6 @@ def load_agent(path: Path, content: bytes) -> tuple[str, str, type[Agent], dict[
 
 
 def configuration_hash(asked: dict[str, Any]) -> str:
-    """Return six digits that identify the arguments of a training but its seed."""
+    """Return six digits that identify the arguments of a training except its seed."""
     rest = {name: value for name, value in asked.items() if name != "seed"}
     return hashlib.sha256(json.dumps(rest, sort_keys=True).encode()).hexdigest()[:6]

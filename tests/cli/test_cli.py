@@ -184,7 +184,7 @@ def test_documented_commands_are_commands():
 @pytest.mark.parametrize(("arguments", "message"), [
     (["run", "--seeds", "exam:1"], "seeds must name one of the splits train, dev, test, got 'exam:1'"),
     (["run", "--seeds", "dev:1-"], "seeds must look like 'test:0-4'"),
-    (["run", "--seeds", "0-3"], "seeds must say of which split: train:0-3, dev:0-3 or test:0-3; got '0-3'"),
+    (["run", "--seeds", "0-3"], "seeds must have a split: train:0-3, dev:0-3 or test:0-3; got '0-3'"),
     (["run", "--env", "eitbench/pip2D-v0"], "Did you mean eitbench/Pipe2D-v0?"),
     (["run", "--baseline", "kalman_fliter"], "Did you mean kalman_filter?"),
     (["run", "--set", "instrument.noise_relativ=0.1"], "Did you mean noise_relative?"),
@@ -195,7 +195,7 @@ def test_documented_commands_are_commands():
     (["run", "--baseline", "broken.py"], "broken.py"),
     (["run", "--baseline", "mine.py", "--env", "eitbench/Pipe2DSmoothing-v0"],
      "baseline mine.py suits none of the environments"),
-    (["leaderboard", "-o", "nothing"], "no results in nothing; make some with `eitbench run`"),
+    (["leaderboard", "-o", "nothing"], "no results in nothing; create some with `eitbench run`"),
     (["render", "--step", "3"], "out must end in .png with step"),
     (["render", "--baseline", "fixed_interval_smoother"], "plays smoothing, but eitbench/Pipe2D-v0 is a filter"),
     (["render", "--env", INJECTION], f"policy must be given for {INJECTION}"),

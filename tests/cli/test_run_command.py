@@ -44,7 +44,7 @@ def test_a_failure_names_the_users_own_lines(isolate, tmp_path):
     failure = complaint[complaint.index("failed:"):]
     assert failure.startswith(f"failed: bad in {PIPE} on dev:0-1: LinAlgError: Singular matrix\n"
                               f'    File "bad.py", line {line}, in update\n      import numpy as np; print(')
-    assert failure.count("File ") == 1 and "no episode was finished by bad" in failure
+    assert failure.count("File ") == 1 and "all episodes failed for bad" in failure
     hint = f"--baseline {tmp_path / 'bad.py'} --seeds dev:0 --isolate none --jobs 1"
     assert hint in failure
     page = (tmp_path / "results" / "index.html").read_text(encoding="utf-8")
@@ -61,7 +61,7 @@ def test_only_a_method_that_finished_nothing_is_an_error(tmp_path):
     given = ["--isolate", "none", *(word for name in ("sometimes", "never", "always")
                                      for word in ("--baseline", f"{name}.py"))]
     code, said, complaint = run(*given)
-    assert code == 1 and "no episode was finished by never\n" in complaint
+    assert code == 1 and "all episodes failed for never\n" in complaint
     assert "dev:0-1, 1 failed" in said and "dev:0-1, 2 failed" in said
     assert run(*given[:4])[0] == 0
 
