@@ -74,7 +74,7 @@ def _superlu(K: sp.csc_matrix) -> tuple[Work, str]:
 
 
 def splu_and_solves(K: sp.csc_matrix, n_ports: int) -> Callable[[], np.ndarray]:
-    """Return a simple solution: factorise by SuperLU, ordered symmetrically; solve for all loads."""
+    """Return a simple solution: factorise by SuperLU, ordered symmetrically; solve all loads."""
     loads = np.eye(K.shape[0], n_ports, n_ports - K.shape[0])
     return lambda: splu(K, permc_spec="MMD_AT_PLUS_A", **SYMMETRIC).solve(loads)[-n_ports:]
 
