@@ -231,8 +231,7 @@ def test_finished_episodes_are_stored(tmp_path, monkeypatch):
 
 
 def test_a_mistake_is_the_result_of_its_policy(tmp_path):
-    """Failed episodes are recorded with the reason, without a row; privileged methods and naive baselines are
-    marked."""
+    """Failed episodes are recorded with the reason, without a row; privileged methods are marked."""
     store = EpisodeStore(tmp_path)
     bad = write_policy(tmp_path, "def act(self, observation): return 0.5", "bad")
     run_jobs(jobs_of([bad, "random_pair"], "dev:0", estimator="reduced"), store)

@@ -96,8 +96,7 @@ def test_only_scored_states_need_a_variance(tmp_path):
 
 
 def test_nis_requires_all_innovations(tmp_path):
-    """NIS requires the innovations of all scored measurements, so that a method cannot have 1 by reporting a single
-    innovation that fits."""
+    """NIS requires the innovations of all scored measurements, not of a selection that fits."""
     fits = "Estimate(self.level, None, np.ones(4), np.eye(4))"
     often, once = (run_episode(Job(FILTER, write_baseline(tmp_path, name, update=update), 1))[0]
                    for name, update in (("often", f"return {fits}"),

@@ -72,8 +72,7 @@ def test_interquartile_mean_pools_and_the_mean_does_not():
     (6, mean_over_environments, 0.932), (10, mean_over_environments, 0.944), (30, mean_over_environments, 0.950),
     (6, interquartile_mean, 0.955), (10, interquartile_mean, 0.972), (30, interquartile_mean, 0.959)])
 def test_coverage(n, statistic, expected):
-    """The coverage of intervals for 1000 data sets of n normal numbers agrees with 6000 other data sets to 3 standard
-    errors.
+    """The coverage of 1000 intervals for n normal numbers agrees with 6000 other data sets to 3 standard errors.
 
     Without the expansion by Student's t it is too small: 0.854, 0.902 and 0.938 for the mean, 0.904, 0.937 and 0.948.
     """
@@ -135,8 +134,7 @@ def test_the_same_numbers_in_another_process():
 
 
 def test_difficulty_of_episodes_cancels():
-    """An improvement by 1/4 on each of very different episodes is exactly recovered; unpaired it would not be
-    significant."""
+    """An improvement of 1/4 on each of very different episodes is exactly recovered."""
     b = {"pipe": seeded(2.0 ** np.arange(10)), "tank": seeded(3.0 * np.arange(7))}
     a = {environment: {seed: score + 0.25 for seed, score in reversed(own.items())} for environment, own in b.items()}
     assert paired_difference(a, b) == pytest.approx((0.25, 0.25, 0.25), rel=1e-12)

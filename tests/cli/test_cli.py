@@ -221,7 +221,7 @@ def test_mistakes_are_explained(arguments, message, tmp_path):
 
 @pytest.mark.parametrize(("given", "isolate"), [([], "auto"), (["--isolate", "process"], "process")])
 def test_render_isolates_methods(given, isolate, monkeypatch):
-    """As in all other commands that run methods."""
+    """The command has the same isolation as all commands that run methods."""
     asked = []
     monkeypatch.setattr(animate, "animate", lambda *_, **how: asked.append(how["isolate"]))
     code, _, complaint = eitbench("render", *given)
