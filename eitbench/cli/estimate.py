@@ -42,10 +42,10 @@ def estimate(
         help="Correction of the misfit on homogeneous fluid: subtract an offset or divide by a "
              "channel gain (offset or gain), or none for absolute images.")] = "offset",
     homogeneous_frames: Annotated[int, typer.Option(
-        min=1, help="Number of first frames of homogeneous fluid, without a reference.")] = 1,
+        min=1, help="Number of initial frames of homogeneous fluid if there is no reference.")] = 1,
 ) -> None:
     """Estimate the concentration in a real tank or pipe: calibrate the vessel, run methods, and
-    write a page with estimates, residuals of withheld readings and data-quality warnings."""
+    write a page with estimates, residuals of withheld measurements and data-quality warnings."""
     from eitbench.bench.measured import plotted_steps
     from eitbench.bench.runner import run_on_measurements
     from eitbench.envs.measured import MeasuredEnv
