@@ -42,7 +42,7 @@ def estimate(
         help="Correction of the misfit on homogeneous fluid: subtract an offset or divide by a "
              "channel gain (offset or gain), or none for absolute images.")] = "offset",
     homogeneous_frames: Annotated[int, typer.Option(
-        min=1, help="Number of initial frames of homogeneous fluid if there is no reference.")] = 1,
+        min=1, help="Number of initial homogeneous frames, used without a reference.")] = 1,
 ) -> None:
     """Estimate the concentration in a real tank or pipe: calibrate the vessel, run methods, and
     write a page with estimates, residuals of withheld measurements and data-quality warnings."""
