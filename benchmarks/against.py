@@ -1,8 +1,8 @@
 """Compare the speed of this checkout with another one: `python benchmarks/against.py OTHER`.
 
-Each measurement is a new process on one thread. The two checkouts take turns, and the fastest of
-several rounds counts, so that other work on the machine affects both alike. The table gives seconds
-of processor time and the ratio of this checkout to the other.
+Each measurement is a new process on one thread. Rounds alternate between the checkouts, so that
+other load affects both equally, and the fastest is used. The table shows seconds of processor time
+and the ratio of this checkout to the other.
 """
 
 from __future__ import annotations
@@ -72,11 +72,11 @@ PPO("MlpPolicy", env, device="cpu").learn(4096)
 print(time.process_time())
 """,
 }
-"""Name -> program that prints the processor seconds of its own measurement."""
+"""Name -> program that measures and prints processor seconds."""
 
 
 def seconds(checkout: Path, program: str) -> float:
-    """Run a program with a checkout's package and an empty cache, and return what it prints."""
+    """Run a program with a checkout's package and an empty cache, and return the printed number."""
     with tempfile.TemporaryDirectory() as cache:
         environment = os.environ | ONE_THREAD | {"PYTHONPATH": str(checkout),
                                                  "EITBENCH_CACHE": cache}

@@ -1,8 +1,6 @@
-"""The frame of the speed benchmarks: timing, rows of the tables, and what this machine can do at
-best.
+"""Common parts of the speed benchmarks: timing, rows of tables, and the machine's peak performance.
 
-All times are the fastest of several calls: on a machine that others use too, the minimum is what
-repeats.
+All times are the minimum of several calls, which is reproducible on a shared machine.
 """
 
 from __future__ import annotations
@@ -43,18 +41,18 @@ ONE_THREAD = {"OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THREADS": "1", "OMP_NUM_THRE
 
 
 def best_of(work: Work, repeats: int = 5) -> float:
-    """Seconds of the fastest call."""
+    """Return the seconds of the fastest call."""
     return compare({"": work}, repeats)[""]
 
 
 def compare(candidates: dict[str, Work], rounds: int = 7, *, warm_up: bool = True,
             turn: float = 0.02
             ) -> dict[str, float]:
-    """Seconds of the fastest call of each candidate.
+    """Return the seconds of the fastest call of each candidate.
 
-    They take turns, so that a machine that changes its pace does so for all; a turn is one call, or
-    as many as fit into ``turn`` seconds. ``warm_up=False`` saves the first call, which is not
-    counted, where a call takes very long.
+    Calls alternate between candidates, so that changes of the machine's speed affect all; a turn is
+    one call, or repeated calls for ``turn`` seconds. ``warm_up=False`` skips the first call, which
+    is not counted, for long calls.
     """
     if warm_up:
         for work in candidates.values():
@@ -74,21 +72,21 @@ def compare(candidates: dict[str, Work], rounds: int = 7, *, warm_up: bool = Tru
 
 
 def in_fresh_process(function: Callable[..., Any], *arguments: Any) -> Any:
-    """The result of a module's function, from a new process limited to one thread."""
+    """Return the result of a module's function, from a new process limited to one thread."""
     os.environ.update(ONE_THREAD)
     with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
         return pool.submit(function, *arguments).result()
 
 
 def peak_growth(work: Work) -> float:
-    """Bytes by which the resident memory of this process rises at most while ``work`` runs (Linux
-    with glibc).
+    """Return the peak growth of this process's resident memory, in bytes, while ``work`` runs
+    (Linux with glibc).
 
-    `resource.getrusage` would count what the process that started this one had in memory.
+    `resource.getrusage` would include memory of the parent process.
     """
     gc.collect()
-    ctypes.CDLL(None).malloc_trim(0)                 # what was freed before must not be used unseen
-    Path("/proc/self/clear_refs").write_text("5")        # the peak starts anew from here
+    ctypes.CDLL(None).malloc_trim(0)                 # freed memory would be reused
+    Path("/proc/self/clear_refs").write_text("5")        # reset the peak
     before = _status("VmRSS")
     work()
     return _status("VmHWM") - before
@@ -105,30 +103,30 @@ def _status(name: str) -> float:
 
 @dataclass
 class Row:
-    """One line of a table: ours against a reference, measured in the same run."""
+    """One row of a table: eitbench and a reference, measured in the same run."""
 
     section: str
     what: str
-    """ours, in words"""
+    """description of the measured work"""
     against: str
-    """the reference, in words"""
+    """description of the reference"""
     ours: float
-    """seconds, or what ``unit`` says"""
+    """value of eitbench in ``unit``"""
     reference: float | None
-    """None: there is none, or the peer is not installed"""
+    """value of the reference; None without one, or if the peer is not installed"""
     target: str = ""
-    """of the ratio, such as "≤ 1.6×", "≤ 1/3" or "≥ 5× faster", or of ours: "≤ 0.5 s", "≥ 60,000/s"
-    """
+    """target of the ratio, e.g. "≤ 1.6×", "≤ 1/3" or "≥ 5× faster", or of ``ours``: "≤ 0.5 s",
+    "≥ 60,000/s" """
     limit: str = ""
-    """what limits us: flops, bytes, Python overhead"""
+    """limiting resource: flops, bytes, Python overhead"""
     ceiling: str = ""
-    """the measured ceiling beside it, such as "2.1 of 38 GFlop/s" """
+    """attained value and measured ceiling, e.g. "2.1 of 38 GFlop/s" """
     unit: str = "s"
     """"s" or "B" """
 
     @property
     def ratio(self) -> float | None:
-        """Ours in parts of the reference."""
+        """Value of eitbench divided by the reference."""
         return None if self.reference is None else self.ours / self.reference
 
     @property
@@ -142,8 +140,8 @@ class Row:
 
     @property
     def met(self) -> bool | None:
-        """Whether the target was met; None without one, or without the reference that it speaks
-        of."""
+        """True if the target is met; None without a target, or without the reference it
+        requires."""
         if not self.target:
             return None
         parsed = re.fullmatch(r"([≤≥]) (\d[\d.,]*(?:/\d+)?)(×|× faster| s|/s|)", self.target)
@@ -162,18 +160,18 @@ class Row:
 
     @property
     def cells(self) -> list[str]:
-        """The table's columns after ``section``, in order."""
+        """Columns of the table after ``section``, in order."""
         verdict = {None: "", True: ", met", False: ", **missed**"}[self.met]
         reference = "–" if self.reference is None else quantity(self.reference, self.unit)
         return [self.what, self.against, quantity(self.ours, self.unit), reference, self.ratio_text,
                 self.target + verdict, self.limit, self.ceiling]
 
 
-COLUMNS = ["what", "against", "ours", "reference", "ratio", "target", "limited by", "ceiling"]
+COLUMNS = ["what", "against", "eitbench", "reference", "ratio", "target", "limited by", "ceiling"]
 
 
 def quantity(value: float, unit: str) -> str:
-    """Three digits and a unit prefix: "1.32 ms", "4.5 GB"."""
+    """Format with three digits and a unit prefix, e.g. "1.32 ms" and "4.5 GB"."""
     sizes = {"G": 1e9, "M": 1e6, "k": 1e3, "": 1.0, "m": 1e-3, "µ": 1e-6, "n": 1e-9}
     prefix = next((prefix for prefix, size in sizes.items()
                    if value >= 0.9995 * size and not (unit == "s" and size > 1)), "n")
@@ -181,7 +179,7 @@ def quantity(value: float, unit: str) -> str:
 
 
 def peer(package: str) -> str:
-    """ "name version", or what is missing, for a row."""
+    """Return "name version" for a row, or that the package is not installed."""
     try:
         return f"{package} {version(package)}"
     except PackageNotFoundError:
@@ -192,7 +190,7 @@ def peer(package: str) -> str:
 
 
 class Ceilings(NamedTuple):
-    """What one thread of this machine reaches when nothing is in the way."""
+    """Peak performance of one thread of this machine."""
 
     gflops: float
     """dgemm, 1000 × 1000"""
@@ -206,7 +204,7 @@ class Ceilings(NamedTuple):
 
 @lru_cache
 def ceilings() -> Ceilings:
-    """Measured once in each process that asks."""
+    """Measure the ceilings, once per process."""
     rng = np.random.default_rng(0)
     A, B = rng.random((2, 1000, 1000))
     product = np.empty_like(A)
@@ -228,15 +226,15 @@ def _nothing() -> None:
 
 
 def of_flops(flops: float, seconds: float) -> str:
-    """Flops reached and reachable, for a row's ceiling."""
+    """Format attained and peak flops, for a row's ceiling."""
     return f"{1e-9 * flops / seconds:.2g} of {ceilings().gflops:.0f} GFlop/s"
 
 
 def machine() -> dict[str, str]:
-    """What the numbers depend on; to be asked before peers load BLAS libraries of their own."""
+    """Describe machine and libraries; call it before peers load other BLAS libraries."""
     cpuinfo = Path("/proc/cpuinfo")
     model = re.search(r"model name\s*:\s*(.+)", cpuinfo.read_text()) if cpuinfo.exists() else None
-    forced = " as OPENBLAS_CORETYPE says" if os.environ.get("OPENBLAS_CORETYPE") else ""
+    forced = " (OPENBLAS_CORETYPE)" if os.environ.get("OPENBLAS_CORETYPE") else ""
     blas = {f"{library['internal_api']} {library['version']}, {library.get('architecture', '?')} "
             f"kernels{forced}, {library['num_threads']} thread" for library in threadpool_info()
             if library["user_api"] == "blas"}

@@ -1,8 +1,9 @@
 """Speed of filters and smoothers: `python benchmarks/run.py filtering`.
 
-First ours and peers on the same matrices: the pipe of `Pipe2D` on three meshes, from the same mean
-and covariance after 60 steps, when the rank of Z has settled, in deviations from the homogeneous
-estimate. Then the cost against nodes, inflow modes and readings, without the forward solution.
+First eitbench and peers with the same matrices: the pipe of `Pipe2D` on three meshes, from the same
+mean and covariance after 60 steps, when the rank of Z has converged, in deviations from the
+homogeneous estimate. Then the cost as a function of nodes, inflow modes and measurements, without
+the forward solution.
 """
 
 from __future__ import annotations
@@ -42,7 +43,7 @@ from eitbench.worlds.registry import entry
 from eitbench.worlds.task import make_task
 
 CELLS = ((19, 4), (44, 10), (80, 20))
-"""along and across the pipe: 100, 495 and 1,701 nodes"""
+"""cells along and across the pipe: 100, 495 and 1,701 nodes"""
 FINE = ((80, 20), (160, 40), (320, 80))
 MODES, READINGS, MEMORY, SMOOTHED, REDUCED = (3, 6, 9, 18), (8, 16, 32, 64), 62, 320, 120
 GOALS = (("Pipe2D", "real_time_filter", "≤ 0.004 s"), ("Pipe3D", "fast_inflow_filter", "≤ 0.015 s"))
@@ -50,7 +51,7 @@ NODAL, WINDOW = "filter step, Π − ZZᵀ", "filter step, inflow window"
 
 
 class Model(NamedTuple):
-    """x⁺ = F x + w from N(mean, P), and a record: H (T, m, n), values (T, m) and their std."""
+    """Model x⁺ = F x + w, x₀ ~ N(mean, P), and measurements: H (T, m, n), values (T, m), std."""
 
     F: np.ndarray
     Q: np.ndarray
@@ -81,7 +82,7 @@ def rows() -> Iterator[Row]:
 
 
 def against_peers(cells: tuple[int, int]) -> Iterator[Row]:
-    """Yield a step in both forms of the covariance against each peer's; all means must agree."""
+    """Compare a step with both forms of the covariance with each peer; all means must agree."""
     settled = problem(cells)
     level, F = settled.start.mean.copy(), settled.motion.transition
     kalman_filter(settled.start, settled.observations[:WARM_UP])
@@ -110,13 +111,13 @@ def against_peers(cells: tuple[int, int]) -> Iterator[Row]:
         seconds = compare(runs, 1 if n > 1500 else 5, warm_up=n < 1500)
         for form, (_, flops) in forms.items():
             step = seconds[form] / STEPS
-            yield row(f"filter step, n = {n}, 16 readings, {form}", step, peer(name),
+            yield row(f"filter step, n = {n}, 16 measurements, {form}", step, peer(name),
                       seconds["theirs"] / STEPS if "theirs" in seconds else None,
                       limit="flops", ceiling=of_flops(flops, step))
 
 
 def textbook(model: Model) -> Run:
-    """F P Fᵀ + Q, S, K, P − K (H P)."""
+    """Return the textbook filter: F P Fᵀ + Q, S, K, P − K (H P)."""
     def run() -> np.ndarray:
         mean, P, means = model.mean, model.P, []
         for H, value, std in zip(model.H, model.values, model.std, strict=True):
@@ -144,7 +145,7 @@ def filterpy(model: Model) -> Run:
 
 
 def dynamax(model: Model) -> Run:
-    """Compiled. It adds 1e-9 to the diagonal of S: units in which this is small, white noise."""
+    """Return dynamax's compiled filter, in units in which the 1e-9 it adds to S is negligible."""
     import jax
     jax.config.update("jax_enable_x64", True)
     from dynamax.linear_gaussian_ssm import lgssm_filter
@@ -159,7 +160,7 @@ def dynamax(model: Model) -> Run:
 
 
 def cuthbert(model: Model) -> Run:
-    """Compiled; its covariances are square roots."""
+    """Return cuthbert's compiled square-root filter."""
     import jax
     jax.config.update("jax_enable_x64", True)
     import cuthbert as them
@@ -185,25 +186,25 @@ def cuthbert(model: Model) -> Run:
 
 
 def growth() -> Iterator[Row]:
-    """Yield the cost of a step against nodes, readings and inflow modes."""
+    """Yield the cost of a step as a function of nodes, measurements and inflow modes."""
     for cells in FINE:
         transport = pipe_model(cells).transport
         n = transport.mesh.n_nodes
         if n < 10_000:
             filter_ = nodal(transport)
             for m in READINGS if n < 2000 else (16,):
-                yield row(f"{NODAL}, n = {n}, {m} readings", step_seconds(filter_, n, m),
+                yield row(f"{NODAL}, n = {n}, {m} measurements", step_seconds(filter_, n, m),
                           limit="flops: F Z" if n < 2000 else "flops: F Z; with 26,001 nodes F and "
                           "Π take 5.4 GB each, and computing Π three times as much")
         for modes in MODES if n < 2000 else (9,):
             filter_ = window(transport, modes)
             for m in READINGS if (n < 2000 and modes == 9) else (16,):
-                yield row(f"{WINDOW}, n = {n}, {modes} modes, {m} readings",
+                yield row(f"{WINDOW}, n = {n}, {modes} modes, {m} measurements",
                           step_seconds(filter_, n, m), limit="bytes: P, moved and updated")
 
 
 def step_seconds(filter_: Filter, n: int, m: int) -> float:
-    """Seconds of the fastest of `STEPS` predictions and updates after `WARM_UP`."""
+    """Return the seconds of the fastest of `STEPS` predictions and updates after `WARM_UP`."""
     rng, times = np.random.default_rng(0), []
     for _ in range(WARM_UP + STEPS):
         seen = LinearMeasurement(rng.random((m, n)) / n, 30.0 + 0.3 * rng.normal(size=m),
@@ -244,7 +245,8 @@ def window(transport, modes: int) -> Filter:
 
 
 def goals() -> Iterator[Row]:
-    """Yield steps of whole methods, forward solution included, and smoothing of a long record."""
+    """Yield steps of complete methods, including the forward solution, and smoothing of a long
+    measurement sequence."""
     for name, method, target in GOALS:
         task = make_task(entry(f"eitbench/{name}-v0").world)
         estimator = load_method(method, "estimation").make(task)

@@ -1,8 +1,7 @@
-"""What a newcomer waits for, with an empty cache: `python benchmarks/run.py first_hour`.
+"""Waiting times of new users, with an empty cache: `python benchmarks/run.py first_hour`.
 
-Each measurement is a new process on one thread; the reference is the same with everything recorded
-before. Times are the processor's, user and system together: on a machine with nothing else to do
-they are what one waits.
+Each measurement is a new process on one thread; the reference is the same with cached episodes.
+Times are processor times, user plus system, which equal the waiting time on an idle machine.
 """
 
 from __future__ import annotations
@@ -27,7 +26,7 @@ from eitbench.worlds.registry import entry
 presimulate_inline(entry(sys.argv[1]).world, range(int(sys.argv[2])))
 """
 FRAMES = 20_000
-"""that PPO learns from"""
+"""Number of training frames of PPO."""
 PPO = """
 import sys, gymnasium, eitbench
 from stable_baselines3 import PPO
@@ -37,12 +36,12 @@ PPO("MlpPolicy", env, device="cpu").learn(int(sys.argv[1]))
 CHECKERS = """
 import warnings
 import gymnasium
-from eitbench.bench.tracks import own_ids
+from eitbench.bench.tracks import builtin_ids
 from gymnasium.utils.env_checker import check_env
 from stable_baselines3.common.env_checker import check_env as check_env_sb3
 warnings.simplefilter("ignore")
 gymnasium.logger.min_level = gymnasium.logger.ERROR
-for id in own_ids():
+for id in builtin_ids():
     check_env(gymnasium.make(id, render_mode="rgb_array").unwrapped)
     check_env_sb3(gymnasium.make(id).unwrapped)
 """
@@ -62,7 +61,7 @@ def rows() -> Iterator[Row]:
 
 
 def observation(id: str) -> Row:
-    """From the start of Python to the first observation of an unseeded reset."""
+    """Measure from the start of Python to the first observation of an unseeded reset."""
     with tempfile.TemporaryDirectory() as cache:
         cold = seconds(cache, "-c", OBSERVATION, id)
         seconds(cache, "-c", RECORD, id, "1")
@@ -73,7 +72,7 @@ def observation(id: str) -> Row:
 
 
 def learning() -> Row:
-    """A frame of plain PPO in one environment."""
+    """Measure a frame of plain PPO in one environment."""
     with tempfile.TemporaryDirectory() as cache:
         cold = seconds(cache, "-c", PPO, str(FRAMES))
         warm = seconds(cache, "-c", PPO, str(FRAMES))
@@ -88,7 +87,7 @@ def _against_a_second_time(what: str, arguments: Sequence[str], target: str, lim
 
 
 def seconds(cache: str, *arguments: str) -> float:
-    """Of the processor, that a new Python takes with this cache folder."""
+    """Return the processor seconds of a new Python process with this cache folder."""
     before = getrusage(RUSAGE_CHILDREN)
     done = subprocess.run([sys.executable, *arguments], check=False, text=True, capture_output=True,
                           env=os.environ | ONE_THREAD | {"EITBENCH_CACHE": cache})

@@ -1,7 +1,7 @@
 """Speed of the complete electrode model: `python benchmarks/run.py forward`.
 
-Conductivities are random and rough, node by node; the pipe and its sixteen electrodes are those of
-`Pipe2D`.
+Conductivities are independent random values at the nodes; the pipe and its sixteen electrodes are
+from `Pipe2D`.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ def conductivities(mesh: Mesh, count: int = BATCH) -> np.ndarray:
 
 
 def system_matrix(cem: CompleteElectrodeModel, sigma: np.ndarray) -> sp.csc_matrix:
-    """K(σ), grounded, its electrodes last: the solver keeps one triangle, here are both."""
+    """Return both triangles of the grounded K(σ), with electrodes last; the solver stores one."""
     system = cem._system
     half = sp.csc_matrix((cem._assemble(sigma), (system.rows, system.columns)),
                          shape=(system.n, system.n))
@@ -64,7 +64,7 @@ def system_matrix(cem: CompleteElectrodeModel, sigma: np.ndarray) -> sp.csc_matr
 
 
 def factor_flops(cem: CompleteElectrodeModel) -> float:
-    """Multiplications and additions of the factorisation, down to the electrodes' Schur
+    """Count multiplications and additions of the factorisation, down to the electrodes' Schur
     complement."""
     start, first_row, *_ = cem._system._symbolic
     width, height = np.diff(start)[:-1], np.diff(first_row)[:-1]
@@ -72,7 +72,7 @@ def factor_flops(cem: CompleteElectrodeModel) -> float:
 
 
 def narrow(cem: CompleteElectrodeModel) -> str:
-    """Why a sparse factor stays far below dgemm."""
+    """Describe the limit of a sparse factorisation, which is far below dgemm."""
     columns = np.diff(cem._system._symbolic[0])[:-1].mean()
     return f"flops, in supernodes of {columns:.1f} columns on average"
 
@@ -80,7 +80,7 @@ def narrow(cem: CompleteElectrodeModel) -> str:
 def against_solvers(cem: CompleteElectrodeModel, sigma: np.ndarray, K: sp.csc_matrix, *,
                     largest: bool
                     ) -> Iterator[Row]:
-    """All electrodes' voltages against factorisations that have not solved anything yet."""
+    """Compare all electrodes' voltages with factorisations without solutions."""
     everything = splu_and_solves(K, cem.n_electrodes - 1)
     ours = cem.transfer_resistance(sigma)
     np.testing.assert_allclose(ours, cem._centred(everything()), atol=1e-10 * np.abs(ours).max())
@@ -101,7 +101,7 @@ def against_solvers(cem: CompleteElectrodeModel, sigma: np.ndarray, K: sp.csc_ma
 
 
 def in_batches(cem: CompleteElectrodeModel, sigma: np.ndarray) -> Row:
-    """Of a batch, a state's share."""
+    """Measure the time per state of a batch."""
     np.testing.assert_allclose(cem.transfer_resistance(sigma[:9])[8],
                                cem.transfer_resistance(sigma[8]), atol=1e-10)
     seconds = compare({"batch": lambda: cem.transfer_resistance(sigma),
@@ -118,8 +118,8 @@ def in_batches(cem: CompleteElectrodeModel, sigma: np.ndarray) -> Row:
 
 
 def derivatives(cem: CompleteElectrodeModel, sigma: np.ndarray, K: sp.csc_matrix) -> Iterator[Row]:
-    """The table, and from it the Jacobians of all pairs, against a pair of solutions for each of
-    their entries."""
+    """Compare the table, and the Jacobians of all pairs computed from it, with two solutions for
+    each entry."""
     pairs = np.zeros((120, cem.n_electrodes))
     for k, (a, b) in enumerate(itertools.combinations(range(cem.n_electrodes), 2)):
         pairs[k, [a, b]] = 1.0, -1.0
@@ -157,8 +157,8 @@ def derivatives(cem: CompleteElectrodeModel, sigma: np.ndarray, K: sp.csc_matrix
 
 
 def quadrature(mesh: Mesh) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
-    """∫ φ_j ∇u·∇w for all nodes j, exact for potentials of second order; as one writes it with
-    scikit-fem."""
+    """Return a straightforward scikit-fem function of ∫ φ_j ∇u·∇w for all nodes j, exact for
+    potentials of second order."""
     basis = skfem.Basis(to_skfem(mesh), element(2, 2), intorder=3)
     hats = basis.with_element(element(2, 1))
     point = np.arange(basis.dx.size).reshape(basis.dx.shape)
@@ -183,12 +183,12 @@ def quadrature(mesh: Mesh) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
 
 
 def table_flops(cem: CompleteElectrodeModel) -> tuple[float, str]:
-    """Of `transfer_resistance_derivatives`, as its steps are written: in sum, and in words."""
+    """Return the flops of `transfer_resistance_derivatives`: sum, and text with all steps."""
     k = cem.n_electrodes
     n_cells = len(cem.mesh.cells)
     substitute = 2.0 * cem._system._symbolic[3][-1] * 16
     gradients = 2.0 * cem._sensitivity._gradient.size * k
-    # 3 vertices: 2·2 for Σ_v G_v G_v, then 1 to add it and 2·2·2 of their own
+    # 3 vertices: 2·2 for Σ_v G_v G_v, then 1 to add it and 2·2·2 for each vertex
     products = 39.0 * k**2 * n_cells
     parts = {"factor": factor_flops(cem), "substitution": substitute, "gradients": gradients,
              "their products": products}
@@ -200,7 +200,7 @@ def table_flops(cem: CompleteElectrodeModel) -> tuple[float, str]:
 
 
 def against_pyeit(cells: tuple[int, int] = (10, 26)) -> Iterator[Row]:
-    """The same mesh, first order for both."""
+    """Compare with pyEIT on the same mesh, with first-order elements for both."""
     mesh = pipe_mesh(*cells)
     cem = electrode_model(mesh, order=1)
     currents = PIPE_2D.currents
@@ -218,12 +218,12 @@ def against_pyeit(cells: tuple[int, int] = (10, 26)) -> Iterator[Row]:
         pass
     seconds = compare(works)
     flops, _ = table_flops(cem)
-    differs = ("point electrodes where ours are complete, a conductivity for each cell where ours "
-               "is for each node")
+    differs = ("point electrodes instead of complete ones, a conductivity for each cell instead "
+               "of each node")
     where = f"order 1, {mesh.n_nodes:,} nodes, {len(mesh.cells):,} cells"
     yield Row("forward", f"voltages of 16 injections, {where}",
               f"{peer('pyeit')} solve_eit on the same mesh: {differs}; factorises for each "
-              "injection anew",
+              "injection",
               seconds["voltages"], theirs["voltages"], "", narrow(cem),
               of_flops(factor_flops(cem), seconds["voltages"]))
     yield Row("forward", f"Jacobian of 16 injections, {where}",
@@ -235,7 +235,7 @@ def against_pyeit(cells: tuple[int, int] = (10, 26)) -> Iterator[Row]:
 
 
 def pyeit_forward(mesh: Mesh, currents: np.ndarray):
-    """pyEIT's solver with an electrode at the wall node nearest to the middle of each of ours."""
+    """Return pyEIT's solver with point electrodes at the nodes nearest to electrode centres."""
     from pyeit.eit.fem import EITForward
     from pyeit.eit.protocol import PyEITProtocol
     from pyeit.mesh import PyEITMesh

@@ -1,10 +1,9 @@
 """The first hour of three users, from the wheel: `python benchmarks/hours.py [FOLDER]`.
 
-Builds the wheel, installs it into a fresh environment, and does in an empty folder, with an empty
-cache, what each would do: who has an estimator, who knows stable-baselines3, who reads the boards.
-Prints every step with its seconds by the clock and its seconds of processor time, which one waits
-on an idle core; the first step that fails ends it. FOLDER (default: a temporary one) is left behind
-for a look at what was made.
+Builds the wheel, installs it into a new environment, and runs in an empty folder, with an empty
+cache, the first commands of three users: with an estimator, with stable-baselines3, and reading the
+leaderboards. Prints wall time and processor time of every step; the latter is the waiting time on
+an idle core. The first failed step ends the program. FOLDER (default: a temporary one) is kept.
 """
 
 from __future__ import annotations
@@ -75,16 +74,16 @@ OURS = "leaderboards/results/eitbench-Pipe2D-v0--{}--v1.json"
 """A record that comes with the package."""
 
 Step = tuple[str, Sequence[str]]
-"""Its name, and what Python is given."""
+"""Name, and arguments of Python."""
 
 
 def command(*words: str) -> Step:
-    """A command of eitbench, named as one types it."""
+    """Return the step of an eitbench command, named as it is typed."""
     return f"`eitbench {' '.join(words)}`", ["-m", "eitbench.cli", *words]
 
 
 HOURS: dict[str, list[Step]] = {
-    "Who has an estimator": [
+    "User with an estimator": [
         command("list"),
         ("`gym.make`, `reset`", ["-c", LOOK]),
         command("run", "--baseline", "mine.py", "--seeds", "dev:0-1"),
@@ -93,7 +92,7 @@ HOURS: dict[str, list[Step]] = {
                 "test:0-1", "--to", "records"),
         command("leaderboard", "--records", "records"),
     ],
-    "Who knows stable-baselines3": [
+    "User of stable-baselines3": [
         ("its `check_env`", ["-c", CHECK]),
         ("`PPO(\"MlpPolicy\", env).learn(6144)`", ["-c", LEARN]),
         command("train", "--env", BUDGET, "--algo", "maskable_ppo", "--config", "short.yml",
@@ -101,7 +100,7 @@ HOURS: dict[str, list[Step]] = {
         command("run", "--env", BUDGET, "--policy", "agent/model.zip", "--policy",
                 "best_cycle", "--seeds", "dev:0-1", "--estimator", "reduced"),
     ],
-    "Who reads the boards": [
+    "Reader of the leaderboards": [
         ("`eitbench.leaderboard.load()`", ["-c", LOAD]),
         command("compare", "kalman_filter", "extended_kalman_filter"),
         command("verify", OURS.format("kalman_filter"), "--episodes", "1"),
@@ -137,7 +136,7 @@ def main() -> None:
 
 
 def timed(name: str, words: Sequence[str], where: Path, **environment: str) -> None:
-    """Run a command in a folder and print how long it took; ends the program if it fails."""
+    """Run a command in a folder and print its duration; end the program if it fails."""
     begin = time.perf_counter()
     before = getrusage(RUSAGE_CHILDREN)
     done = subprocess.run(words, cwd=where, env=os.environ | {"PYTHONPATH": ""} | environment,

@@ -1,6 +1,6 @@
-"""What the compiled kernels buy: the same work by numba and by scipy.
+"""Speed of the compiled kernels relative to scipy: `python benchmarks/run.py kernels`.
 
-scipy's way is the tests' reference, `tests/references.py`: `python benchmarks/run.py kernels`.
+The scipy implementation is the reference of the tests, `tests/references.py`.
 """
 
 from __future__ import annotations
@@ -54,16 +54,16 @@ def electrode_models(name: str, cells: tuple[int, int]) -> Iterator[Row]:
 
 
 def both(what: str, models: list, work: Callable, rounds: int = 7) -> Row:
-    """The work by our model and by the reference, with equal results."""
+    """Compare the time of the compiled model with the reference, and check their results."""
     ours, scipy = (flat(work(model)) for model in models)
     np.testing.assert_allclose(ours, scipy, rtol=0.0, atol=1e-9 * np.abs(scipy).max())
     works = {"ours": lambda: work(models[0]), "scipy": lambda: work(models[1])}
     seconds = compare(works, rounds)
-    return Row("kernels", what, "ours with scipy's SuperLU and sparse products", seconds["ours"],
-               seconds["scipy"])
+    return Row("kernels", what, "eitbench with scipy's SuperLU and sparse products",
+               seconds["ours"], seconds["scipy"])
 
 
 def flat(result) -> np.ndarray:
-    """All numbers of one array or of several."""
+    """Concatenate all numbers of one or several arrays."""
     parts = result if isinstance(result, tuple) else (result,)
     return np.concatenate([np.ravel(part) for part in parts])

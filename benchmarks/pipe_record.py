@@ -1,5 +1,5 @@
-"""The record on which filters and smoothers are timed: the pipe of `Pipe2D`, on a mesh of any
-fineness."""
+"""Measurement sequence for timing filters and smoothers: the pipe of `Pipe2D` on a mesh of any
+resolution."""
 
 from __future__ import annotations
 
@@ -21,15 +21,15 @@ from eitbench.worlds.catalogue import PIPE_2D
 from eitbench.worlds.world import Discretisation
 
 WARM_UP, STEPS = 60, 8
-"""steps before anything is timed; steps timed, half a frame"""
+"""untimed steps; timed steps, half a frame"""
 
 
 @dataclass
 class Problem:
-    """A linear Gaussian model, and a record of it."""
+    """Linear Gaussian model with a measurement sequence."""
 
     start: Filter
-    """at t = 0"""
+    """filter at t = 0"""
     noise: np.ndarray
     """(n, n) Γ_w"""
     observations: list[LinearMeasurement]
@@ -44,7 +44,7 @@ class Problem:
 
 
 def problem(cells: tuple[int, int], steps: int = WARM_UP + STEPS) -> Problem:
-    """The model on a mesh of so many cells; states and measurements are drawn from it."""
+    """Return the model on a mesh of ``cells``, and measurements simulated with it."""
     transport, seen = pipe_model(cells)
     level = PIPE_2D.expected_concentration
     evolution = transport.evolution_model()
@@ -67,7 +67,7 @@ def problem(cells: tuple[int, int], steps: int = WARM_UP + STEPS) -> Problem:
 
 
 def pipe_model(cells: tuple[int, int]) -> Discretisation:
-    """The estimators' model, but with so many cells of concentration along and across the pipe."""
+    """Return the estimator model with ``cells`` of the concentration along and across the pipe."""
     told = PIPE_2D.estimator_model()
     pipe = PIPE_2D.vessel
     known = told.transport
@@ -84,5 +84,5 @@ def pipe_model(cells: tuple[int, int]) -> Discretisation:
 
 
 def same(ours: np.ndarray, theirs: np.ndarray, tolerance: float = 1e-10) -> None:
-    """Means agree relative to the largest entry."""
+    """Check that means agree relative to the largest entry."""
     np.testing.assert_allclose(ours, theirs, rtol=0.0, atol=tolerance * np.abs(theirs).max())

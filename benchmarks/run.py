@@ -1,7 +1,7 @@
-"""Speed against peers: `python benchmarks/run.py [section …]` measures, and writes `results.json`
-and `README.md`.
+"""Compare the speed with peers: `python benchmarks/run.py [section …]` measures, and writes
+`results.json` and `README.md`.
 
-Each section runs in a process of its own, limited to one thread, and replaces its part of the
+Each section runs in a separate process, limited to one thread, and replaces its part of the
 results.
 """
 
@@ -21,22 +21,23 @@ from eitbench._files import write_atomically
 
 HERE = Path(__file__).parent
 SECTIONS = {"first_hour": "The first hour, with an empty cache",
-            "forward": "Complete electrode model", "kernels": "What the compiled kernels buy",
+            "forward": "Complete electrode model", "kernels": "Compiled kernels",
             "filtering": "Kalman filter and smoother",
             "stepping": "Environments",
             "simulation": "Simulation of new episodes", "scaling": "Growth with size"}
-"""name of a module here, with `rows()` or `curves()` → heading"""
+"""name of a module in this folder, with `rows()` or `curves()` → heading"""
 
 INTRODUCTION = """# Speed
 
-Ours against others, measured in the same run, everything on one thread. A ratio is our time in
-parts of the reference's, or, where it says faster, the reverse. Each time is the fastest of several
-calls, between which the candidates take turns; references that run for seconds run once or twice.
-Results are compared with the reference's before, except with pyEIT, whose model differs. *Ours with
-scipy's SuperLU and sparse products* is the reference in `tests/references.py`. On a machine that
-others share, a ratio may differ by a third from run to run. *Limited by* says what our time goes
-into, *ceiling* how much we reach of what this machine can do at best, measured in the same process.
-Targets were set before measuring.
+eitbench and peers, measured in the same run on one thread. Each time is the minimum of several
+calls, which alternate between the candidates; references that take seconds run once or twice.
+Results are first compared with the reference, except pyEIT, whose model differs. On a shared
+machine a ratio may vary by a third between runs. Targets were set before measuring.
+
+- *ratio*: time of eitbench divided by the reference, or the inverse for "faster"
+- *limited by*: resource that dominates the time of eitbench
+- *ceiling*: attained fraction of the machine's peak performance, measured in the same process
+- *eitbench with scipy's SuperLU and sparse products*: the reference in `tests/references.py`
 
 ```sh
 python3 -m venv peers
@@ -44,7 +45,7 @@ peers/bin/pip install -c constraints.txt -e . -r benchmarks/requirements.txt
 peers/bin/python benchmarks/run.py            # or only some: run.py forward
 ```
 
-This page is written by that command. A peer that is not installed leaves a dash.
+The command writes this page. A peer that is not installed has a dash.
 """
 
 
@@ -53,7 +54,7 @@ def main() -> None:
     parser.add_argument("sections", nargs="*", metavar="section",
                         help=f"of {', '.join(SECTIONS)}; default: all")
     parser.add_argument("--render-only", action="store_true",
-                        help="write README.md anew from results.json")
+                        help="only rewrite README.md from results.json")
     arguments = parser.parse_args()
     if unknown := set(arguments.sections) - set(SECTIONS):
         parser.error(f"no section {', '.join(sorted(unknown))}; there are {', '.join(SECTIONS)}")
@@ -67,7 +68,7 @@ def main() -> None:
 
 
 def measure(section: str) -> dict[str, Any]:
-    """All of one section, for `results.json`."""
+    """Measure one section, for `results.json`."""
     record: dict[str, Any] = {"machine": machine(), "ceilings": ceilings()._asdict()}
     begin = time.monotonic()
     module = import_module(section)

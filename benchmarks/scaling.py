@@ -1,4 +1,4 @@
-"""How cost grows with size: `python benchmarks/run.py scaling` measures, fits exponents and draws
+"""Growth of cost with size: `python benchmarks/run.py scaling` measures, fits exponents and draws
 `scaling.png`."""
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ FLOW_CELLS = ((44, 10), (62, 15), (83, 23), (124, 31))
 
 @dataclass
 class Curve:
-    """y(x), drawn in double logarithm: curves of one ``column`` stand above each other."""
+    """Curve y(x) in a double logarithmic plot; curves of one ``column`` share a column."""
 
     column: str
     label: str
@@ -38,7 +38,7 @@ class Curve:
 
     @property
     def exponent(self) -> float:
-        """p of y ∝ xᵖ, by least squares in the logarithms."""
+        """Exponent p of y ∝ xᵖ, by least squares in the logarithms."""
         return float(np.polyfit(np.log(self.x), np.log(self.y), 1)[0])
 
 
@@ -61,10 +61,10 @@ def curves() -> Iterator[Curve]:
 
 
 def forward_model(cells: tuple[int, int]) -> tuple[float, float, float]:
-    """Unknowns, seconds of `transfer_resistance`, and peak bytes of setting up the model and
-    solving once."""
+    """Return the number of unknowns, seconds of `transfer_resistance`, and peak bytes of model
+    setup and one solution."""
     small = pipe_mesh(1, 2)
-    # loads what is loaded once
+    # load kernels and libraries first
     electrode_model(small).transfer_resistance(conductivities(small, 1)[0])
     models = []
 
@@ -79,8 +79,8 @@ def forward_model(cells: tuple[int, int]) -> tuple[float, float, float]:
 
 
 def kalman_step(cells: tuple[int, int]) -> tuple[float, float, float]:
-    """Nodes, seconds of a step once the rank has settled, and bytes of its model F, s, Π and of one
-    step's arrays."""
+    """Return the number of nodes, seconds of a step after the rank has converged, and bytes of the
+    model F, s, Π and the arrays of one step."""
     record = problem(cells)
     ours = copy.copy(record.start)
     kalman_filter(ours, record.observations[:WARM_UP])
@@ -97,7 +97,7 @@ def kalman_step(cells: tuple[int, int]) -> tuple[float, float, float]:
 
 
 def draw(curves: list[Curve], path: Path) -> None:
-    """A column for each thing that grows, time above memory."""
+    """Draw a column of panels for each quantity, time above memory."""
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
     from matplotlib.ticker import NullFormatter, NullLocator, StrMethodFormatter

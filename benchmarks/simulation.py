@@ -61,7 +61,7 @@ def rows() -> Iterator[Row]:
 
 
 def bank(jobs: int) -> float:
-    """Seconds that the command takes for a bank in an empty cache, its start included."""
+    """Return the seconds of `eitbench bank` with an empty cache, including the start of Python."""
     with tempfile.TemporaryDirectory() as empty:
         begin = time.perf_counter()
         command = [sys.executable, "-m", "eitbench.cli.app", "bank", "--seeds",

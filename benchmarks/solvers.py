@@ -1,6 +1,6 @@
-"""Bare numeric refactorisations by other people's sparse solvers: new values on a known pattern.
+"""Numeric refactorisations by other sparse solvers: new values with a known sparsity pattern.
 
-Each is given its matrix in the form that it likes best, outside the clock, and solves nothing.
+Matrices are converted to each solver's preferred form before timing; no system is solved.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ SYMMETRIC = {"diag_pivot_thresh": 0.0, "options": {"SymmetricMode": True}}
 
 
 def refactorisations(K: sp.csc_matrix) -> tuple[dict[str, Work], list[str]]:
-    """Name and version → what to call, for a symmetric positive definite K; and missing peers."""
+    """Return name and version → function for a symmetric positive definite K; missing peers."""
     found: dict[str, Work] = {}
     missing = []
     for package, prepare in (("qdldl", _qdldl), ("cholespy", _cholespy), ("pypardiso", _pardiso),
@@ -41,7 +41,7 @@ def _qdldl(K: sp.csc_matrix) -> tuple[Work, str]:
 def _cholespy(K: sp.csc_matrix) -> tuple[Work, str]:
     import cholespy
     parts = K.shape[0], K.indptr, K.indices, K.data, cholespy.MatrixType.CSC
-    return (lambda: cholespy.CholeskySolverD(*parts)), " (analyses anew)"
+    return (lambda: cholespy.CholeskySolverD(*parts)), " (repeats the analysis)"
 
 
 def _pardiso(K: sp.csc_matrix) -> tuple[Work, str]:
@@ -74,14 +74,14 @@ def _superlu(K: sp.csc_matrix) -> tuple[Work, str]:
 
 
 def splu_and_solves(K: sp.csc_matrix, n_ports: int) -> Callable[[], np.ndarray]:
-    """What one writes first: factorise by SuperLU, ordered symmetrically; solve every electrode."""
+    """Return a simple solution: factorise by SuperLU, ordered symmetrically; solve all loads."""
     loads = np.eye(K.shape[0], n_ports, n_ports - K.shape[0])
     return lambda: splu(K, permc_spec="MMD_AT_PLUS_A", **SYMMETRIC).solve(loads)[-n_ports:]
 
 
 def entry_by_entry(K: sp.csc_matrix, n_ports: int, integrate: Integrate) -> np.ndarray:
-    """Derivatives of the ports' block of K⁻¹, (n_nodes, m, m): for each entry a forward and an
-    adjoint solution."""
+    """Compute derivatives of the ports' block of K⁻¹, (n_nodes, m, m), with a forward and an
+    adjoint solution for each entry."""
     n = K.shape[0]
     factors = splu(K, permc_spec="MMD_AT_PLUS_A", **SYMMETRIC)
     entries = {}
@@ -94,8 +94,8 @@ def entry_by_entry(K: sp.csc_matrix, n_ports: int, integrate: Integrate) -> np.n
 
 
 def pair_by_pair(K: sp.csc_matrix, currents: np.ndarray, integrate: Integrate) -> np.ndarray:
-    """Derivatives of the ports' voltages, (patterns, m, n_nodes), for currents (patterns, m): two
-    solutions a row."""
+    """Compute derivatives of the ports' voltages, (patterns, m, n_nodes), for currents (patterns,
+    m), with two solutions per row."""
     n, n_ports = K.shape[0], currents.shape[1]
     factors = splu(K, permc_spec="MMD_AT_PLUS_A", **SYMMETRIC)
     rows = []

@@ -1,7 +1,6 @@
-"""Speed of the environments, from recordings that are there: `python benchmarks/run.py stepping`.
+"""Speed of the environments with cached episodes: `python benchmarks/run.py stepping`.
 
-Episodes are played from reset to end, so that the resets are counted. Times are for one step of one
-environment.
+Episodes run from reset to end, so that resets are included. Times are per step of one environment.
 """
 
 from __future__ import annotations
@@ -33,8 +32,8 @@ def rows() -> Iterator[Row]:
 
 
 def starting() -> Iterator[Row]:
-    """Imports, and environments made by a new process."""
-    gym.make(INJECTION).reset(seed=0)                 # everything that is kept on disk is there now
+    """Measure imports, and the creation of environments in a new process."""
+    gym.make(INJECTION).reset(seed=0)                 # fill the cache on disk
     code = ("import time; t = time.perf_counter(); import eitbench, gymnasium; i = "
             "time.perf_counter(); "
             f"gymnasium.make({ESTIMATION!r}); print(i - t, time.perf_counter() - i)")
@@ -56,14 +55,14 @@ def estimation() -> Iterator[Row]:
               "entries of M̃")
     ours = vector_step(gym.make_vec(ESTIMATION, num_envs=ENVS,
                                     vectorization_mode="vector_entry_point"), choose)
-    limit = "bytes: estimates are checked, transposed and weighed"
-    ceiling = (f"{8e-9 * estimate.size / ours:.1f} GB/s of estimates taken in, read at "
+    limit = "bytes: estimates are checked, transposed and weighted"
+    ceiling = (f"{8e-9 * estimate.size / ours:.1f} GB/s of estimates, read at "
                f"{ceilings().read:.0f}")
     for mode, reference in (("sync", "SyncVectorEnv"), ("async", "AsyncVectorEnv")):
         theirs = vector_step(gym.make_vec(ESTIMATION, num_envs=ENVS, vectorization_mode=mode),
                              choose, episodes=1)
         yield Row("stepping", f"{ESTIMATION}, {ENVS} at once",
-                  f"gymnasium's {reference} over ours one by one", ours,
+                  f"gymnasium's {reference} over single environments", ours,
                   theirs, "≥ 60,000/s", limit, ceiling)
 
 
@@ -81,7 +80,7 @@ def injection() -> Iterator[Row]:
                                 estimator=estimator, threads=threads)
             ours = vector_step(envs, choose)
             yield Row("stepping", f"{what}, {ENVS} at once, {threads} thread{'s' * (threads > 1)}",
-                      "ours one by one", ours, alone,
+                      "one environment", ours, alone,
                       targets[1] if estimator == "none" or threads == 2 else "", limit,
                       reached(estimator, ours, threads))
     inflow = gym.make_vec(INFLOW, num_envs=ENVS, vectorization_mode="vector_entry_point")
@@ -94,13 +93,13 @@ def reached(estimator: str, seconds: float, threads: int) -> str:
     if estimator == "none":
         return f"{seconds / ceilings().call:.0f} empty calls"
     r, m = 120, 16
-    # A is block triangular: a third is saved
+    # a third less, as A is block triangular
     flops = 4 * r**3 * 2 / 3 + 2 * (2 * m * r**2) + 2 * m**2 * r
     return f"{1e-9 * flops / seconds:.0f} of {threads} × {ceilings().gflops:.0f} GFlop/s"
 
 
 def scalar_step(env: gym.Env, choose: Callable[[], object], episodes: int = 12) -> float:
-    """Seconds a step, of the fastest of several episodes after the first two."""
+    """Return the seconds per step of the fastest of several episodes after the first two."""
     best = np.inf
     for seed in range(episodes):
         begin = time.perf_counter()
@@ -117,7 +116,7 @@ def scalar_step(env: gym.Env, choose: Callable[[], object], episodes: int = 12) 
 
 def vector_step(envs: gym.vector.VectorEnv, choose: Callable[[], np.ndarray],
                 episodes: int = 5) -> float:
-    """Seconds for one step of one of the environments, of the fastest of several episodes after the
+    """Return the seconds per step of one environment, in the fastest of several episodes after the
     first."""
     best = np.inf
     for round_ in range(episodes + 1):
@@ -141,7 +140,7 @@ COUNTS = (1, 4, 16, 64, 256)
 
 
 def environments() -> Iterator[tuple[str, list[float], list[float]]]:
-    """Kind, steps per second and peak bytes for `COUNTS` environments at once, for the figure."""
+    """Yield kind, steps per second and peak bytes for `COUNTS` environments, for the figure."""
     presimulate(PIPE_2D, range(EPISODES), n_jobs=1)
     for kind in KINDS:
         measured = [in_fresh_process(growth, kind, count) for count in COUNTS]
@@ -149,24 +148,24 @@ def environments() -> Iterator[tuple[str, list[float], list[float]]]:
 
 
 def growth(kind: str, count: int) -> tuple[float, float]:
-    """Steps per second, and bytes by which an episode's arrays raise the peak of this process."""
+    """Return steps per second, and the growth of peak memory by an episode's arrays in bytes."""
     name, kwargs = KINDS[kind]
     choose = chooser(name, count)
-    gym.make(name, **kwargs).reset(seed=0)             # what all environments share is there before
+    gym.make(name, **kwargs).reset(seed=0)             # load shared data first
     made = []
 
-    def play() -> None:
+    def start() -> None:
         made.append(gym.make_vec(name, num_envs=count, vectorization_mode="vector_entry_point",
                                  **kwargs))
         made[0].reset(seed=[k % EPISODES for k in range(count)])
         made[0].step(choose())
 
-    memory = peak_growth(play)
+    memory = peak_growth(start)
     return 1.0 / vector_step(made[0], choose, episodes=3), memory
 
 
 def chooser(name: str, count: int) -> Callable[[], np.ndarray]:
-    """Actions for so many environments."""
+    """Return a function that returns actions for ``count`` environments."""
     rng = np.random.default_rng(0)
     if name == INJECTION:
         return lambda: rng.integers(120, size=count)

@@ -1,7 +1,7 @@
 """eitbench: process tomography as Gymnasium environments, with baselines and scores.
 
-Importing it registers the environments ``eitbench/…-v0`` and those of installed packages; heavy
-modules are loaded on first use.
+The import registers the environments ``eitbench/…-v0`` and environments of installed packages;
+heavy modules are loaded on first use.
 """
 
 from importlib import import_module
@@ -63,7 +63,7 @@ def __getattr__(name: str) -> Any:
     raise AttributeError(f"module 'eitbench' has no attribute {name!r}")
 
 
-# measurement files of users, and public ones; they have no world
+# environments of users' and public measurement files, without a world
 _gym.register("eitbench/Measured-v0", entry_point="eitbench.envs.measured:MeasuredEnv")
 for _case in sorted((_Path(__file__).parent / "measured" / "cases").glob("*.yml")):
     _gym.register(f"eitbench/Measured-{_case.stem}-v0",

@@ -1,4 +1,4 @@
-"""Argument checks whose errors name the argument, the accepted values and the given one."""
+"""Argument checks; errors name the argument, the accepted values and the given value."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ from typing import Any
 import numpy as np
 
 NUMERIC_KINDS = "biufO"
-"""Kinds of arrays that can hold real numbers; not complex ones, dates or text."""
+"""Kinds of arrays that can hold real numbers, without complex numbers, dates and text."""
 MAX_DEPTH = 20
-"""Default of the depth to which lists and dicts may be nested."""
+"""Default limit of the depth of nested lists and dicts."""
 
 
 def number(name: str, value: object, *, low: float = -math.inf, high: float = math.inf,
            open_low: bool = False, units: str = "") -> float:
     """Return ``value`` as a finite float within [low, high] (``open_low``: within (low, high]);
-    ``ValueError`` for others, for booleans, and for what `array` rejects."""
+    ``ValueError`` for other values, booleans, and types that `array` rejects."""
     try:
         kind = np.asarray(value).dtype.kind
         if kind == "b" or kind not in NUMERIC_KINDS:
@@ -35,7 +35,7 @@ def number(name: str, value: object, *, low: float = -math.inf, high: float = ma
 
 
 def integer(name: str, value: object, *, low: int, high: int | None = None) -> int:
-    """Return ``value`` as an int within [low, high]; ``ValueError`` for others."""
+    """Return ``value`` as an int within [low, high]; ``ValueError`` for other values."""
     # stable-baselines3 returns a single action as an array without axes
     if isinstance(value, np.ndarray) and value.ndim == 0 and value.dtype.kind in "iu":
         value = value.item()
@@ -94,7 +94,7 @@ def did_you_mean(given: object, known: Iterable[str]) -> str:
 
 
 def depth(name: str, value: Any, deepest: int = MAX_DEPTH) -> None:
-    """``ValueError`` if lists and dicts are nested deeper."""
+    """Raise ``ValueError`` if lists and dicts are nested more than ``deepest`` levels deep."""
     level = [value]
     for _ in range(deepest):
         level = [inner for each in level if isinstance(each, (list, tuple, dict))
@@ -105,8 +105,8 @@ def depth(name: str, value: Any, deepest: int = MAX_DEPTH) -> None:
 
 
 def json_object(name: str, value: object, size: int) -> None:
-    """``ValueError`` unless ``value`` is a dict that JSON holds in ``size`` bytes, with finite
-    numbers, also as floats, and no deeper than `depth` accepts."""
+    """Raise ``ValueError`` unless ``value`` is a dict that fits in ``size`` bytes of JSON, with
+    numbers that are finite as floats, nested as `depth` accepts."""
     try:
         if not isinstance(value, dict):
             raise TypeError(f"got {type(value).__name__}")

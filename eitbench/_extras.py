@@ -17,7 +17,7 @@ EXTRAS = {
 
 
 def missing_extra(what: str, error: ModuleNotFoundError) -> str | None:
-    """Return a sentence with the extra that installs the missing module; None if none does."""
+    """Return a sentence with the extra that installs the missing module; None without one."""
     missing = (error.name or "").partition(".")[0]
     for extra, modules in EXTRAS.items():
         if missing in modules:

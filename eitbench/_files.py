@@ -12,16 +12,15 @@ from tempfile import TemporaryDirectory
 PACKAGE = Path(__file__).parent
 """Folder of this package."""
 BUNDLED = ("baselines", "leaderboards")
-"""Folders that come with the package. Models of agents, learned networks, animations and the
-rendered site are in a checkout only: with them an installed package would be four times as
-large."""
+"""Folders that come with the package. Checkpoints of agents, trained networks, animations and the
+rendered site are in a checkout only; they would make an installed package four times larger."""
 
 
 @contextmanager
 def atomic_path(path: Path) -> Iterator[Path]:
     """Yield a temporary path that replaces ``path`` if no error occurs; create parent folders."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    # unlike a file of mkstemp, with the permissions of the umask
+    # unlike a file from mkstemp, it has the permissions of the umask
     temporary = path.with_name(f".{path.name}.{uuid.uuid4().hex}")
     try:
         yield temporary
@@ -31,13 +30,13 @@ def atomic_path(path: Path) -> Iterator[Path]:
 
 
 def write_atomically(path: Path, data: bytes) -> None:
-    """Write a file as a whole or not at all; create parent folders."""
+    """Write a file atomically; create parent folders."""
     with atomic_path(path) as temporary:
         temporary.write_bytes(data)
 
 
 def replace_folder(folder: Path, files: Mapping[str, bytes]) -> None:
-    """Replace a folder by one with these files only, written in full before the old one moves."""
+    """Replace a folder by one with these files only; the new one is complete before the swap."""
     folder = folder.resolve()
     folder.parent.mkdir(parents=True, exist_ok=True)
     with TemporaryDirectory(prefix=f".{folder.name}.", dir=folder.parent) as temporary:
@@ -56,13 +55,13 @@ def replace_folder(folder: Path, files: Mapping[str, bytes]) -> None:
 
 
 def bundled_path(name: str) -> Path:
-    """Return a folder of `BUNDLED`: inside an installed package, beside it in a checkout."""
+    """Return a folder of `BUNDLED`: inside an installed package, next to it in a checkout."""
     return PACKAGE / name if (PACKAGE / name).is_dir() else PACKAGE.parent / name
 
 
 def resolve_input(path: Path) -> Path:
-    """Return ``path`` if it exists; else, if it begins with one of `BUNDLED` and exists there, the
-    shipped file or folder."""
+    """Return ``path`` if it exists; else the bundled file or folder if ``path`` starts with one of
+    `BUNDLED` and exists there."""
     if path.exists() or not path.parts or path.parts[0] not in BUNDLED:
         return path
     found = bundled_path(path.parts[0]).joinpath(*path.parts[1:])

@@ -1,4 +1,4 @@
-"""Notices about work that takes longer than two seconds."""
+"""Notices about tasks that take longer than two seconds."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import time
 from tqdm import tqdm
 
 NOTIFY_AFTER_S = 2.0
-"""Seconds of work without a notice."""
+"""Duration of a task without a notice."""
 LOGGER_NAME = "eitbench"
 """Name of the logger, and prefix of notices."""
 
@@ -23,15 +23,15 @@ def notify(text: str) -> None:
 
 
 class SlowTaskNotice:
-    """Report once that work of ``total`` steps is going to take longer than `NOTIFY_AFTER_S`.
+    """Report once that a task of ``total`` steps will take longer than `NOTIFY_AFTER_S`.
 
     Parameters
     ----------
     what : str
-        Description of the work.
+        Description of the task.
     total : int
     beforehand : str
-        How to have it done at another time.
+        Hint how to do the task in advance.
     """
 
     def __init__(self, what: str, total: int, beforehand: str) -> None:

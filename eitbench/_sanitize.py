@@ -15,14 +15,14 @@ MAX_STACK_FRAMES = 20
 _LIBRARIES = [PACKAGE, *(Path(sysconfig.get_path(name)).resolve()
                          for name in ("stdlib", "purelib", "platlib"))]
 _INVISIBLE = {"Cc", "Cf", "Cs", "Cn", "Zl", "Zp"}
-"""Categories of characters that are invisible, but move a cursor, reverse or end a line."""
+"""Categories of invisible characters, which may move a cursor, or reverse or end a line."""
 _MARKDOWN = re.compile(r"[\\`*\[\]<>|~&!]|(?<!\w)_|_(?!\w)|(?<=\w):(?=//)|(?<=www)\.",
                        re.IGNORECASE)
-"""Characters that can start markup within a line; not the _ of a_name."""
+"""Characters that can start markup within a line, without the _ inside a name."""
 
 
 def sanitize(text: str, *, lines: bool = False) -> str:
-    """Escape control characters, and those that change the direction of text, as Python does; with
+    """Replace control characters and bidirectional marks by Python's escape sequences; with
     ``lines``, keep line ends and tabs."""
     if text.isascii() and text.isprintable():
         return text
@@ -42,15 +42,15 @@ def escape_csv(text: str) -> str:
 
 
 def error_location(error: BaseException, own: Path | None = None) -> str:
-    """Return name and line of the file where an error occurred: the innermost stack frame of
-    `user_traceback`, or of all if that is empty."""
+    """Return name and line of the file in which an error occurred: the innermost stack frame of
+    `user_traceback`, or of the full traceback if that is empty."""
     last = (_own_frames(error, own) or traceback.extract_tb(error.__traceback__))[-1]
     return f"{Path(last.filename).name}:{last.lineno}"
 
 
 def user_traceback(error: BaseException, own: Path) -> str:
-    """Return the traceback from a method's file ``own`` on, without libraries and folders; empty
-    if the error occurred elsewhere."""
+    """Return the traceback starting at a method's file ``own``, without libraries and folders;
+    empty if the error occurred elsewhere."""
     frames = [traceback.FrameSummary(Path(frame.filename).name, frame.lineno, frame.name,
                                      lookup_line=False, line=frame.line or "")
               for frame in _own_frames(error, own)]

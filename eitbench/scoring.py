@@ -1,5 +1,5 @@
-"""Scores as functions of arrays (``docs/methods.md``, 4). Lower is better unless stated; `E` is the
-relative error (5.12)."""
+"""Scores as functions of arrays (``docs/methods.md``, 4). Lower is better unless stated otherwise;
+`E` is the relative error (5.12)."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from scipy.special import ndtr, ndtri
 
 def step_errors(estimate: np.ndarray, truth: np.ndarray, mass: Any,
                 reference: float = 0.0) -> np.ndarray:
-    """(T,) ∫(ĉ_t − c_t)² / ∫(c_t − reference)² for nodal values (T, n) on the truth's mesh.
+    """Compute (T,) ∫(ĉ_t − c_t)² / ∫(c_t − reference)² for nodal values (T, n) on the truth mesh.
 
-    ``mass`` (n, n) is the mass matrix of that mesh, dense or sparse. The ``reference`` 0 gives the
-    terms of (5.12), the homogeneous estimate the contrast form.
+    ``mass`` (n, n) is the mass matrix of that mesh, dense or sparse. With ``reference`` 0 these are
+    the terms of (5.12), with the homogeneous estimate those for the contrast error.
     """
     estimate, truth = _pair(estimate, truth)
     return _squares(estimate - truth, mass) / _squares(truth - reference, mass)
@@ -23,30 +23,29 @@ def step_errors(estimate: np.ndarray, truth: np.ndarray, mass: Any,
 
 def relative_error(estimate: np.ndarray, truth: np.ndarray, mass: Any,
                    reference: float = 0.0) -> float:
-    """ẽ_c = (1/T) Σ_t ∫(ĉ_t − c_t)² / ∫c_t² (thesis 5.12: squared, no root); arguments as in
-    `step_errors`."""
+    """Compute ẽ_c = (1/T) Σ_t ∫(ĉ_t − c_t)² / ∫c_t² (thesis 5.12: squared, no root); arguments as
+    in `step_errors`."""
     return float(step_errors(estimate, truth, mass, reference).mean())
 
 
 def voltage_discrepancy(measured: np.ndarray, computed: np.ndarray) -> float:
-    """ẽ_V = 1/(T·N_V) Σ_t ‖V_t − V̂_t‖² in V² for (T, N_V) voltages (thesis 5.13)."""
+    """Compute ẽ_V = 1/(T·N_V) Σ_t ‖V_t − V̂_t‖² in V² for (T, N_V) voltages (thesis 5.13)."""
     measured, computed = _pair(measured, computed)
     return float(((measured - computed)**2).mean())
 
 
 def normalised_innovations(innovation: np.ndarray, covariance: np.ndarray) -> np.ndarray:
-    """NIS/m at each t: νᵀS⁻¹ν/m for innovations (T, m) and covariances (T, m, m); averages 1 in a
-    consistent filter."""
+    """Compute NIS/m at each t, νᵀS⁻¹ν/m for innovations (T, m) and covariances (T, m, m); the mean
+    is 1 for a consistent filter."""
     whitened = np.linalg.solve(covariance, innovation[..., None])[..., 0]
     return np.einsum("tm,tm->t", innovation, whitened) / innovation.shape[1]
 
 
 def crps(mean: np.ndarray, std: np.ndarray, truth: np.ndarray, weights: np.ndarray) -> float:
-    """Continuous ranked probability score of Gaussian marginals, averaged over time and, with
-    ``weights`` (n,), space.
+    """Compute the continuous ranked probability score of Gaussian marginals (T, n), averaged over
+    time and, with ``weights`` (n,), space.
 
-    In the unit of the truth. (T, n) arrays; a zero ``std`` gives the absolute error (Gneiting &
-    Raftery 2007).
+    It has the unit of the truth; a zero ``std`` gives the absolute error (Gneiting & Raftery 2007).
     """
     mean, truth = _pair(mean, truth)
     error = np.abs(truth - mean)
@@ -60,8 +59,8 @@ def crps(mean: np.ndarray, std: np.ndarray, truth: np.ndarray, weights: np.ndarr
 
 def coverage(mean: np.ndarray, std: np.ndarray, truth: np.ndarray, weights: np.ndarray,
              level: float) -> float:
-    """Fraction of space and time in which the truth is in the central ``level`` interval of the
-    Gaussian marginal; arguments as in `crps`."""
+    """Compute the fraction of space and time in which the truth is in the central ``level``
+    interval of the Gaussian marginal; arguments as in `crps`."""
     mean, truth = _pair(mean, truth)
     return float(np.average((np.abs(truth - mean) <= ndtri(0.5 + level / 2) * std).mean(axis=0),
                             weights=weights))
@@ -69,24 +68,23 @@ def coverage(mean: np.ndarray, std: np.ndarray, truth: np.ndarray, weights: np.n
 
 def spread_ratio(mean: np.ndarray, std: np.ndarray, truth: np.ndarray,
                  weights: np.ndarray) -> float:
-    """Mean variance divided by the mean squared error; 1 for calibrated uncertainty, more if it is
-    overestimated."""
+    """Compute the mean variance divided by the mean squared error; 1 for calibrated uncertainty,
+    more if it is overestimated."""
     mean, truth = _pair(mean, truth)
     variance = np.average((std**2).mean(axis=0), weights=weights)
     return float(variance / np.average(((mean - truth)**2).mean(axis=0), weights=weights))
 
 
 def normalised_score(error: float, homogeneous: float, reference: float) -> float:
-    """(E_bh − E)/(E_bh − E_ref): 0 for the homogeneous estimate, 1 for the reference; higher is
-    better."""
+    """Compute (E_bh − E)/(E_bh − E_ref): 0 for the homogeneous estimate, 1 for the reference;
+    higher is better."""
     return (homogeneous - error) / (homogeneous - reference)
 
 
 def deficit_centroid(values: np.ndarray, points: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """(d,) centroid in m of the deficit median − value, where it exceeds half its maximum.
-
-    Takes nodal ``values`` (n,), ``points`` (n, d) in m, and ``weights`` (n,), the nodes' areas:
-    row sums of the mass matrix.
+    """Compute the centroid (d,) in m of the deficit median − value where it exceeds half its
+    maximum, from nodal ``values`` (n,), ``points`` (n, d) in m and ``weights`` (n,), the areas of
+    the nodes (row sums of the mass matrix).
     """
     deficit = np.median(values) - values
     counted = weights * np.where(deficit > 0.5 * deficit.max(), deficit, 0.0)

@@ -25,7 +25,7 @@ def load(folder: Path | str | None = None, *, measured: bool = False) -> pd.Data
         Default: the published records, ``leaderboards/results``, or the table of their episodes
         where only that is installed.
     measured : bool
-        Whether to include records of measured cases, which are in a checkout only.
+        Include records of measured cases, which are in a checkout only.
 
     Returns
     -------
@@ -33,8 +33,7 @@ def load(folder: Path | str | None = None, *, measured: bool = False) -> pd.Data
         environment, board, method, version, title, role, privileged, official, outdated, split,
         seed, status, metric, value. Metrics have the names and units of
         ``leaderboards/schema.json`` (s, V², bytes). A failed episode has one row, with the metric
-        error and no value. ``outdated`` marks records of an earlier version of a built-in method
-        than the newest one.
+        error and no value. ``outdated`` marks records of a superseded version of a built-in method.
 
     Raises
     ------
@@ -71,7 +70,7 @@ def _rows(record: dict[str, Any], outdated: bool) -> Iterator[tuple[Any, ...]]:
 
 
 def _without_steps(record: dict[str, Any]) -> dict[str, Any]:
-    """Drop the errors of single steps, most of a record, which no row holds."""
+    """Drop the errors of single steps, which no row holds and which are most of a record."""
     for episode in record["episodes"]:
         episode.pop("step_errors", None)
     return record

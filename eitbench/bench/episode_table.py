@@ -1,7 +1,7 @@
-"""One compact table of all published episodes and their scores, made from the records.
+"""Compact table of all published episodes and their scores, generated from the records.
 
-A package ships it in place of hundreds of JSON files. A row is an episode; scores and times are in
-SI units and have all their digits, as in the records.
+The package ships it in place of hundreds of JSON files. A row is an episode; scores and times are
+in SI units and have all their digits, as in the records.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ TABLE_NAME = "episodes.csv.gz"
 _OF_RECORDS = ("board", "method", "version", "title", "role", "privileged", "official", "split")
 _COLUMNS = ("id", "environment", "kwargs", *_OF_RECORDS, "finished", "seed", "status",
             "peak_memory")
-"""before the scores"""
+"""columns before the scores"""
 
 
 def table_path(folder: Path) -> Path:
@@ -29,8 +29,8 @@ def table_path(folder: Path) -> Path:
 
 
 def write_episode_table(records: Iterable[dict[str, Any]], path: Path) -> None:
-    """Write the episodes of records as compressed CSV, atomically; the same records always give the
-    same bytes with one version of zlib."""
+    """Write the episodes of records as compressed CSV, atomically; for one version of zlib the
+    bytes depend on the records only."""
     content = gzip.compress(episode_table(records).encode(), mtime=0)
     write_atomically(path, content)
 
@@ -55,8 +55,8 @@ def episode_table(records: Iterable[dict[str, Any]]) -> str:
 
 
 def read_episode_table(path: Path) -> list[dict[str, Any]]:
-    """Read the records of a table: as they were written, without runs, parameters, hashes and the
-    errors of single steps. ``ValueError``, naming the file, if it is damaged."""
+    """Read the records of a table, without runs, parameters, hashes and errors of single steps.
+    ``ValueError``, naming the file, if it is damaged."""
     records: dict[tuple[str, ...], dict[str, Any]] = {}
     try:
         text = gzip.decompress(Path(path).read_bytes()).decode()

@@ -1,4 +1,4 @@
-"""`evaluate`: the scores of a method as a table, in Python, with nothing written to disk."""
+"""Compute the scores of a method as a table in Python, without writing to disk (`evaluate`)."""
 
 from __future__ import annotations
 
@@ -25,16 +25,16 @@ from eitbench.data.seeds import format_seed, parse_seeds
 def evaluate(method: Any, env: str | gym.Env, seeds: str | Iterable[int], *,
              world: dict[str, Any] | None = None, n_jobs: int = 1,
              isolate: str | None = None) -> pd.DataFrame:
-    """Run a method on episodes, and score it as the commands do.
+    """Run a method on episodes and compute the same scores as the commands.
 
-    By default the method's code runs in this process, with all its rights: it can read the truth,
-    files and the network. Use ``isolate`` for a third-party file.
+    By default the method's code runs in this process, with all its rights: it can access the ground
+    truth, files and the network. Use ``isolate`` for a third-party file.
 
     ``method`` is a class ``Estimator`` or ``Policy`` as in a method's file, the name of a built-in
     method, or the path of a file; ``env`` a registered id, or an environment made by
     `gymnasium.make`, whose arguments are used; ``seeds`` such as ``"dev:0-9"``, or numbers;
-    ``world`` changes of the world as `gymnasium.make` takes them. ``isolate`` is the option of
-    ``eitbench run``, for a method by name or path.
+    ``world`` the argument of `gymnasium.make` that changes the world. ``isolate`` is the option of
+    ``eitbench run``, for a method given by name or path.
 
     Returns
     -------
@@ -42,8 +42,8 @@ def evaluate(method: Any, env: str | gym.Env, seeds: str | Iterable[int], *,
         A row for each seed: environment, method, seed (as ``dev:3``), and each score by its name,
         in SI units as in ``leaderboards/schema.json``; None where the method gives no value.
 
-    ``ValueError`` if an argument is wrong, or the method does not suit the environment. Exceptions
-    of the method pass, with a note that names the episode.
+    ``ValueError`` if an argument is invalid, or the method is incompatible with the environment.
+    Exceptions of the method propagate, with a note that names the episode.
     """
     asked = resolve_environment(env, world)
     if isolate is None:
@@ -65,7 +65,7 @@ def evaluate(method: Any, env: str | gym.Env, seeds: str | Iterable[int], *,
 
 
 def _method(runner: Method | Job) -> Method:
-    """Return the method; of a job that of the isolated process, which is started once."""
+    """Return the method; a job's method runs in its isolated process, which is started once."""
     return runner.load() if isinstance(runner, Job) else runner
 
 

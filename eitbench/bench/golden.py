@@ -1,9 +1,9 @@
-"""Golden files: reference numbers of a few episodes of each world and of each built-in method.
+"""Golden files: expected values of a few episodes of each world and of each built-in method.
 
-A golden file decides whether numbers have changed; the text of the code does not. Each world's file
-holds numbers of its model, of two simulated episodes (one of them unshortened), and the first
-observations of its environment; each method's file holds scores and estimates in two short episodes
-and in one unshortened episode. Tolerances allow for other processors and BLAS kernels.
+A version of a world or method changes with these values, not with the code. Each world's file holds
+values of its model, of two simulated episodes (one of full length), and the first observations of
+its environment; each method's file holds scores and estimates in two short episodes and in one of
+full length. Tolerances allow for differences between processors and BLAS kernels.
 """
 
 from __future__ import annotations
@@ -50,19 +50,19 @@ from eitbench.worlds.world import World
 WORLD_FOLDER = PACKAGE / "worlds" / "golden"
 METHOD_FOLDER = baseline_folder() / "golden"
 FIRST_STEPS = 24
-"""Simulated steps of a shortened episode; they include the first scored ones."""
+"""Number of simulated steps of a shortened episode; they include the first scored steps."""
 WORLD_EPISODES = {"train:0": FIRST_STEPS, "dev:0": None}
 """Seed -> number of simulated steps of a world's golden episode; None: the whole episode."""
 OBSERVATION_SEEDS = ("train:0", "dev:0", "dev:1")
 QUICK_SEEDS = ("train:0",)
-"""The shortened episode of worlds, which a quick check computes alone."""
+"""Seed of the only episode that a quick check computes: the shortened one."""
 N_OBSERVATIONS = 3
-"""Observations of each of these seeds: that of `reset` and those of two steps."""
+"""Number of observations for each of these seeds: one from `reset` and two from `step`."""
 N_ENTRIES = 5
-"""Nodes of an estimate, and entries of an observation, that a golden file holds."""
+"""Number of an estimate's nodes that a golden file holds."""
 RTOL_FLOAT64 = 1e-6
 RTOL_FLOAT32 = 1e-4
-"""Relative tolerances. The reduced filter and stored moments are in single precision."""
+"""Relative tolerances. The reduced filter and stored load vectors are in single precision."""
 
 
 # -- files ----------------------------------------------------------------------------------------
@@ -88,10 +88,10 @@ def read_golden(name: str) -> dict[str, Any] | None:
 
 
 def check(name: str, *, is_quick: bool = False) -> list[str]:
-    """Compare a built-in id or method with its golden file: one sentence for each number that
-    differs; a method's scores that the file does not have are ignored.
+    """Compare a built-in id or method with its golden file: return one sentence for each number
+    that differs. Scores of a method that the file does not hold are ignored.
 
-    A quick check is of the first episode, which is shortened; for a world also of its model and of
+    A quick check covers the first episode, which is shortened, and for a world also its model and
     the first observations of that seed.
     """
     try:
@@ -111,15 +111,15 @@ def update(names: list[str], *, new_version: bool = False) -> Iterator[tuple[str
     """Compare built-in ids and methods (default: all) with their golden files, and write missing
     files.
 
-    With ``new_version`` a method's file whose numbers moved is written with the next version
-    number; otherwise it stays as it is, as a world's file always does.
+    With ``new_version``, a method's file whose numbers differ is rewritten with the next version
+    number; otherwise it is not changed. A world's file is never changed.
 
     Yields
     ------
     name, status, differences
         ``status`` is ``new``, ``same``, ``moved``, or the new version.
 
-    ``ValueError`` if a name is neither an id nor a built-in method's.
+    ``ValueError`` if a name is neither a built-in id nor a built-in method.
     """
     ids, methods = tracks.builtin_ids(), golden_methods()
     if unknown := [name for name in names if name not in ids and name not in methods]:
@@ -161,8 +161,8 @@ def differences(computed: Any, expected: Any, tolerance: float = RTOL_FLOAT64,
                 place: str = "") -> list[str]:
     """Describe each number of two golden files that differs by more than the tolerance.
 
-    Both arguments are as JSON gives them. A difference is relative to the largest number of its
-    list; observations of a world have the tolerance `RTOL_FLOAT32`.
+    Both arguments are decoded JSON. A difference is relative to the largest number of its list;
+    observations of a world have the tolerance `RTOL_FLOAT32`.
     """
     if isinstance(computed, dict) and isinstance(expected, dict):
         if computed.keys() != expected.keys():
@@ -194,7 +194,7 @@ def _is_numeric(value: Any) -> bool:
 
 
 def world_golden(id: str, *, is_quick: bool = False) -> dict[str, Any]:
-    """Compute the golden numbers of a registered id: its world's, and its first observations."""
+    """Compute the golden numbers of a registered id: of its world, and its first observations."""
     episodes, seeds = (QUICK_SEEDS, QUICK_SEEDS) if is_quick else ((*WORLD_EPISODES,),
                                                                    OBSERVATION_SEEDS)
     return {"id": id, **world_numbers(entry(id).world, episodes),
@@ -209,9 +209,9 @@ def world_numbers(world: World, episodes: tuple[str, ...]) -> dict[str, Any]:
     -------
     dict
         JSON-ready: ``model`` (computed voltages in V, a transport step in mol/m³), and for each of
-        ``episodes`` some entries of 𝓡 in Ω, noise draws, voltages in V, moments b_t,
-        ∫(c − background)², ∫c², moments of the flow, faults, ĉ_bh in mol/m³, and the mean relative
-        error of that estimate.
+        ``episodes`` some entries of 𝓡 in Ω, noise draws, voltages in V, load vectors b_t,
+        ∫(c − background)², ∫c², load vectors of the velocity, faults, ĉ_bh in mol/m³, and the mean
+        relative error of that estimate.
     """
     return {"model": _model_numbers(world.truth_config),
             "episodes": {name: _episode_numbers(world, name) for name in episodes}}
@@ -257,7 +257,7 @@ def _model_numbers(world: World) -> dict[str, Any]:
 
 
 def _shown_steps(n_steps: int) -> list[int]:
-    """Return the steps, counted from 0, whose numbers a golden file holds."""
+    """Return the steps, counted from 0, for which a golden file holds numbers."""
     first = [0, 8, min(FIRST_STEPS, n_steps) - 1]
     return first + [n_steps // 2, n_steps - 1] * (n_steps > FIRST_STEPS)
 
@@ -345,15 +345,15 @@ def _fixed_action(env: gym.Env, k: int) -> Any:
 
 
 def _new_golden(name: str, method: str) -> dict[str, Any]:
-    """Choose the episodes of a method's first golden file: those of the first golden file all of
-    whose environments the method plays. ``ValueError`` if there is none."""
+    """Choose the episodes of a method's first golden file: the episodes of the first existing file
+    whose environments are all compatible with the method. ``ValueError`` without such a file."""
     for known in filter(None, map(read_golden, golden_methods())):
         asked = [{key: episode[key] for key in ("environment", "kwargs", "seed")}
                  for episode in known["episodes"]]
         if all(_can_play(method, each["environment"], each["kwargs"]) for each in asked):
             return {"method": name, "version": 1, "tolerance": known["tolerance"],
                     "episodes": asked}
-    raise ValueError(f"method {name} plays the episodes of no golden file")
+    raise ValueError(f"method {name} must be compatible with the environments of a golden file")
 
 
 def _can_play(method: str, id: str, kwargs: dict[str, Any]) -> bool:
@@ -365,11 +365,11 @@ def _can_play(method: str, id: str, kwargs: dict[str, Any]) -> bool:
 
 
 def _method_golden(golden: dict[str, Any], method: str) -> dict[str, Any]:
-    """Run the episodes of a method's golden file again, and return it with today's numbers.
+    """Rerun the episodes of a method's golden file, and return it with the new numbers.
 
-    ``scores`` are the finite ones that do not measure time. An estimator has ``mean`` and ``last``:
-    entries of its mean and last estimate in mol/m³; a policy has ``injections``: source and sink
-    electrode of each step. ``ValueError`` if the method does not suit.
+    ``scores`` are the finite scores except times. For an estimator, ``mean`` and ``last`` are
+    entries of its mean and last estimate in mol/m³; for a policy, ``injections`` are the source and
+    sink electrodes of each step. ``ValueError`` if the method is incompatible.
     """
     return golden | {"episodes": [_run_episode(episode, method) for episode in golden["episodes"]]}
 

@@ -1,8 +1,8 @@
-"""Compare a record with held-out episodes, whose seeds follow from a secret of the maintainers.
+"""Compare a record with held-out episodes, whose seeds are derived from the maintainers' secret.
 
 Held-out episode k = 0, 1, … has the seed SHA-256(secret ‖ k) mod 2⁶³, with k as eight bytes, most
 significant first. The SHA-256 of the secret is committed to ``leaderboards/held_out.json``, so that
-the secret cannot be chosen after a method was seen.
+the secret cannot be chosen after a method is known.
 """
 
 from __future__ import annotations
@@ -34,8 +34,8 @@ FIRST_SEED = max(split.stop for split in SPLITS.values())
 
 
 def read_secret(path: Path) -> bytes:
-    """Read the secret, hexadecimal digits in a file of its owner only. ``ValueError`` if it cannot
-    be read, others or isolated methods can read it, or another secret is committed."""
+    """Read the secret, hexadecimal digits in a private file. ``ValueError`` if it cannot be read,
+    other users or isolated methods can read it, or it does not match the commitment."""
     check_out_of_reach(path, "secret")
     try:
         is_shared = os.name == "posix" and path.stat().st_mode & 0o077
@@ -62,15 +62,15 @@ def held_out_seeds(secret: bytes, count: int) -> list[int]:
 
 def verify_held_out(record: dict[str, Any], job: Job, secret: bytes,
                     episodes: int) -> tuple[dict[str, str], list[str]]:
-    """Run a record's method on held-out episodes, and test whether its record is better.
+    """Run a record's method on held-out episodes, and test whether the recorded errors are smaller.
 
-    The errors of both are relative to those of the naive baseline on the same episodes, which is
-    run here too.
+    Both errors are relative to the error of the naive baseline on the same episodes, which is run
+    here too.
 
-    ``job`` comes from `verify.job_for_record`. Returns a row with the geometric mean of the
-    relative errors, public and held-out, and p; and a sentence for each problem. ``ValueError`` if
-    the episodes are too few for the test, or the method is third-party and not confined by
-    bubblewrap: it could read the seeds.
+    ``job`` is the result of `verify.job_for_record`. Returns a row with the geometric means of the
+    relative errors, recorded and held-out, and p; and a sentence for each problem. ``ValueError``
+    if the episodes are too few for the test, or a third-party method is not confined by bubblewrap
+    and could read the seeds.
     """
     if not is_builtin(job.method) and job.isolation != "bubblewrap":
         raise ValueError(f"{job.method} must run under bubblewrap on held-out episodes, got "
@@ -100,8 +100,8 @@ def verify_held_out(record: dict[str, Any], job: Job, secret: bytes,
 
 
 def p_value(recorded: np.ndarray, held_out: np.ndarray, n_resamples: int = 9999) -> float:
-    """Return how often a random division of all values has recorded ones at least as small,
-    relative to the held-out ones, in the mean (permutation test, one-sided)."""
+    """Return the p-value of a one-sided permutation test: the fraction of random divisions in which
+    mean(recorded) − mean(held-out) is at most the actual difference."""
     result = permutation_test(
         (recorded, held_out), lambda a, b, axis: a.mean(axis=axis) - b.mean(axis=axis),
         vectorized=True, alternative="less", n_resamples=n_resamples,
@@ -110,15 +110,15 @@ def p_value(recorded: np.ndarray, held_out: np.ndarray, n_resamples: int = 9999)
 
 
 def _errors(job: Job, seeds: list[int]) -> list[Any]:
-    """Return the error of each episode, or the message of one that failed."""
+    """Return the error of each episode, or the message of a failed episode."""
     results = (run_episode(job._replace(seed=seed))[0] for seed in seeds)
     return [result["scores"]["error"] if result["status"] == "ok" else result["message"]
             for result in results]
 
 
 def _log_ratios(errors: list[Any], naive: list[Any]) -> np.ndarray:
-    """Return log(error / naive error) of the episodes that both finished, rounded to what another
-    processor repeats."""
+    """Return log(error / naive error) of the episodes that both finished, rounded to digits that do
+    not depend on the processor."""
     ratios = [a / b for a, b in zip(errors, naive, strict=True)
               if not isinstance(a, str) and not isinstance(b, str) and b > 0.0]
     return np.round(np.log(np.maximum(ratios, MIN_RATIO)), 6)

@@ -1,10 +1,9 @@
-"""Run a third-party estimator or policy in a separate process, confined by bubblewrap where asked.
+"""Run a third-party estimator or policy in a separate process, optionally confined by bubblewrap.
 
 The worker process receives measurements on its standard input and returns estimates or actions on
-its standard output; messages are JSON and numeric arrays, and nothing that a worker sends is
-unpickled. Under bubblewrap it has no network, no capabilities, its own process table, and a file
-system that holds only Python, installed packages, this package and a private /tmp
-(``docs/trust.md``).
+its standard output; messages are JSON and numeric arrays, and a worker's messages are never
+unpickled. Under bubblewrap it has no network, no capabilities, a separate process table, and a file
+system with only Python, installed packages, this package and a private /tmp (``docs/trust.md``).
 """
 
 from __future__ import annotations
@@ -66,11 +65,11 @@ INSTALL = ("install bubblewrap (apt-get install bubblewrap), or accept a process
 REPLY_TIMEOUT_S = 600.0
 EPISODE_TIMEOUT_S = 6 * 3600.0
 CHECK_INTERVAL_S = 0.2
-"""between two checks of a worker's memory and number of threads"""
+"""time between two checks of a worker's memory and number of threads"""
 MAX_HEADER_BYTES = 1 << 20
 MAX_ARRAY_BYTES = 1 << 28
 MAX_OUTPUT_CHARS = 10_000
-"""of printed text that is shown for one episode"""
+"""limit of the printed text that is shown for one episode"""
 METHOD_NAME = re.compile(r"[^./\\][^/\\]{0,99}")
 NUMERIC_ENV = ("OPENBLAS_", "MKL_", "OMP_", "NPY_", "NUMBA_CPU")
 """Prefixes of environment variables that change the last bits of results."""
@@ -88,16 +87,16 @@ class WorkerError(RuntimeError):
 
     where = "worker"
     traceback = ""
-    """Lines of the method's own file that led to the error."""
+    """Stack frames of the method's file that led to the error."""
 
 
 class Limits(NamedTuple):
     """Resources that a worker and all processes it starts may use."""
 
     memory: int = 8 << 30
-    """bytes of address space of one process, and of resident memory of all"""
+    """bytes of address space of one process, and of resident memory of all processes"""
     threads: int = 512
-    """processes and threads"""
+    """number of processes and threads"""
     disk: int = 1 << 30
     """bytes of one file, and of the private /tmp under bubblewrap"""
 
@@ -107,10 +106,10 @@ def choose_isolation(environment: Environment, method: str, isolate: str = "auto
     """Return ``none``, ``process`` or ``bubblewrap`` for a method, given by name or path.
 
     ``auto`` runs built-in methods in this process, and third-party files in a plain process, or
-    under bubblewrap if ``strict``. Other values hold for built-in methods too, except privileged
-    ones. On measurements every method runs in this process, since a worker would read the file with
-    the withheld ones too. ``ValueError`` if there is no such value, bubblewrap is required and does
-    not work, or a third-party file would run in this process where that is ``strict``.
+    under bubblewrap if ``strict``. Other values apply to built-in methods too, except privileged
+    ones. On measurements every method runs in this process, because a worker could read withheld
+    measurements from the file. ``ValueError`` if the value is invalid, bubblewrap is required and
+    does not work, or with ``strict`` a third-party file would run in this process.
     """
     if isolate not in ISOLATE:
         raise ValueError(f"isolate must be one of {', '.join(ISOLATE)}, got {isolate!r}")
@@ -143,7 +142,7 @@ def _notify_of_process(method: str) -> None:
 
 @cache
 def bubblewrap_problem() -> str:
-    """Return why bubblewrap cannot confine a process here; empty if it can."""
+    """Return the reason why bubblewrap cannot confine a process here; empty if it can."""
     if not shutil.which("bwrap"):
         return "bubblewrap is not installed"
     command = [*bubblewrap(Limits()), sys.executable, "-S", "-c", ""]
@@ -156,7 +155,7 @@ def bubblewrap_problem() -> str:
 
 def bubblewrap(limits: Limits, files: Mapping[str, str] | None = None) -> list[str]:
     """Return the command line that confines a program; ``files`` maps further paths inside the
-    sandbox to files outside that it may read."""
+    sandbox to readable files outside."""
     command = ["bwrap", "--unshare-all", "--die-with-parent", "--new-session", "--cap-drop", "ALL",
                "--proc", "/proc", "--dev", "/dev", "--size", str(1 << 26), "--tmpfs", "/dev/shm",
                "--size", str(limits.disk), "--tmpfs", "/tmp"]
@@ -167,11 +166,11 @@ def bubblewrap(limits: Limits, files: Mapping[str, str] | None = None) -> list[s
 
 
 def readable_paths() -> list[Path]:
-    """Return the files and folders that a worker under bubblewrap reads: Python, installed
-    packages, this package and its built-in methods, but nothing else of a checkout."""
+    """Return the files and folders that a worker under bubblewrap can read: Python, installed
+    packages, this package and its built-in methods, but no other part of a checkout."""
     installed = [place for place in sys.path
                  if Path(place).name in ("site-packages", "dist-packages")]
-    # An installed package lies among its dependencies, a checkout among records and tests.
+    # an installed package is next to its dependencies, a checkout's package next to records
     if not (PACKAGE.parent / "pyproject.toml").exists():
         installed.append(str(PACKAGE.parent))
     points = [point for group in _ENTRY_POINTS for point in entry_points(group=group)]
@@ -185,7 +184,7 @@ def readable_paths() -> list[Path]:
 
 
 def check_out_of_reach(path: Path, name: str) -> None:
-    """Raise ``ValueError``, naming what ``name`` calls it, if workers can read the path."""
+    """Raise ``ValueError`` if workers can read the path, which ``name`` describes."""
     for place in readable_paths():
         if path.resolve().is_relative_to(place.resolve()):
             raise ValueError(f"{name} {path} must lie outside {place}, which isolated methods can "
@@ -196,7 +195,7 @@ def check_out_of_reach(path: Path, name: str) -> None:
 
 
 def encode_message(header: Mapping[str, Any], arrays: Arrays | None = None) -> bytes:
-    """Return a message: two lengths, JSON of header and array layout, and the arrays' bytes."""
+    """Encode a message: two lengths, JSON of header and array layout, and the arrays' bytes."""
     blocks = {name: np.asarray(array, order="C") for name, array in (arrays or {}).items()}
     layout = [[name, _numeric(block.dtype.str), block.shape] for name, block in blocks.items()]
     head = json.dumps([header, layout]).encode()
@@ -206,8 +205,8 @@ def encode_message(header: Mapping[str, Any], arrays: Arrays | None = None) -> b
 
 def decode_message(read: Callable[[int], bytes], max_array_bytes: int = MAX_ARRAY_BYTES,
                    ) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    """Return header and arrays of the next message, where ``read(n)`` returns exactly n bytes.
-    ``ValueError`` if it is too long or malformed."""
+    """Decode header and arrays of the next message; ``read(n)`` returns exactly n bytes.
+    ``ValueError`` if the message is too long or malformed."""
     head_bytes, body_bytes = struct.unpack("<QQ", read(16))
     if head_bytes > MAX_HEADER_BYTES or body_bytes > max_array_bytes:
         raise ValueError(f"a message must have at most {MAX_HEADER_BYTES} bytes of JSON and "
@@ -232,7 +231,7 @@ def decode_message(read: Callable[[int], bytes], max_array_bytes: int = MAX_ARRA
 
 
 def _numeric(dtype: Any) -> str:
-    """Return the dtype if it is numeric; numpy parses others as structures and objects."""
+    """Return the dtype if it is numeric; numpy would parse others as structures and objects."""
     if not isinstance(dtype, str) or not _NUMERIC_DTYPE.fullmatch(dtype):
         raise ValueError(f"values must be finite in JSON and numeric in arrays, got {dtype!r}")
     return dtype
@@ -242,7 +241,7 @@ def _numeric(dtype: Any) -> str:
 
 
 _Key = tuple[str, str, str, str, str, str]
-"""Track, id, kwargs as JSON, method, sha256 of its file, and isolation of a worker."""
+"""Track, id, kwargs as JSON, method, sha256 of its file, and kind of isolation."""
 _current: dict[_Key, Worker] = {}
 """The worker of this process, which serves one method in one environment; empty or one entry."""
 
@@ -251,8 +250,8 @@ def load_isolated(track: str, id: str, kwargs: str, method: str, isolation: str)
     """Load a method, by name or path, for an environment with these arguments (JSON), without
     executing its file in this process.
 
-    ``ValueError`` if there is no such file, it cannot be loaded, it is privileged, or it uses the
-    name of a built-in method.
+    ``ValueError`` if the file is missing, cannot be loaded, is privileged, or has the name of a
+    built-in method.
     """
     path = find_method(method, track)
     if is_builtin(method):
@@ -266,7 +265,7 @@ def load_isolated(track: str, id: str, kwargs: str, method: str, isolation: str)
 
 
 def peak_memory() -> int | None:
-    """Return the most bytes that a process of the current worker has held; None if unknown."""
+    """Return the peak memory in bytes of a process of the current worker; None if unknown."""
     return next((worker.peak_memory for worker in _current.values()), None)
 
 
@@ -280,7 +279,7 @@ atexit.register(close)
 
 
 class _RemoteClass:
-    """Stands for a method's class: an instance is the worker, at the beginning of an episode."""
+    """Callable in place of a method's class: returns the worker, at the start of an episode."""
 
     def __init__(self, key: _Key, suits: Callable[[Any], bool]) -> None:
         self._key = key
@@ -293,7 +292,7 @@ class _RemoteClass:
 
 
 def _worker(key: _Key) -> Worker:
-    """Return the current worker if it serves this method, else a new one in its place."""
+    """Return the current worker if it serves this method, else replace it by a new one."""
     worker = _current.get(key)
     if worker is None or not worker.is_alive:
         close()
@@ -345,10 +344,10 @@ def _check_about(path: Path, about: dict[str, Any], track: str) -> None:
 class Worker:
     """A process that runs one estimator or policy in one environment, episode after episode.
 
-    ``method`` is the name of a built-in method, or the path of a file, whose content is sent to the
-    worker, which makes its own environment. A reply may take ``reply_timeout`` seconds.
-    `WorkerError` if the method cannot be loaded; ``ValueError`` if the cache folder lies where a
-    worker under bubblewrap can read.
+    ``method`` is the name of a built-in method, or the path of a file. The content of the file is
+    sent to the worker, which makes a separate environment. A reply may take ``reply_timeout``
+    seconds. `WorkerError` if the method cannot be loaded; ``ValueError`` if a worker under
+    bubblewrap could read the cache folder.
     """
 
     def __init__(self, track: str, id: str, kwargs: dict[str, Any], method: str,
@@ -356,7 +355,7 @@ class Worker:
                  reply_timeout: float = REPLY_TIMEOUT_S) -> None:
         self.reply_timeout = reply_timeout
         self.sha256 = ""
-        """of the file that runs; empty for a built-in method"""
+        """hash of the method's file; empty for a built-in method"""
         self._name = sanitize(Path(method).stem)
         self._limits = limits or Limits()
         self._left_s, self._left_chars = EPISODE_TIMEOUT_S, MAX_OUTPUT_CHARS
@@ -378,13 +377,13 @@ class Worker:
             os.set_blocking(self._input, False)
             self.about = self._ask("load", self._files(id, method), track=track, id=id,
                                    kwargs=kwargs)[0]
-            """What the method's class reports about itself, unchecked."""
+            """Unchecked attributes that the method's class reports."""
         except BaseException:
             self.close()
             raise
 
     def begin(self, random: np.random.Generator | None = None) -> None:
-        """Begin an episode with a new instance of the method; a policy draws from a generator in
+        """Begin an episode with a new instance of the method; a policy draws from a generator with
         the state of ``random``."""
         self._left_s, self._left_chars = EPISODE_TIMEOUT_S, MAX_OUTPUT_CHARS
         self._ask("begin", random=None if random is None else random.bit_generator.state)
@@ -407,12 +406,12 @@ class Worker:
 
     @property
     def is_alive(self) -> bool:
-        """Whether the process can be asked: not after a crash, a limit or a malformed message."""
+        """True unless the process ended: after a crash, a limit or a malformed message."""
         return self._process.poll() is None
 
     @property
     def peak_memory(self) -> int | None:
-        """Most bytes that one of its processes has held; None where /proc does not tell."""
+        """Peak memory in bytes of one of its processes; None where /proc does not report it."""
         return max((_status(pid, "VmHWM") for pid in self._family()), default=0) or None
 
     def close(self) -> None:
@@ -425,7 +424,7 @@ class Worker:
             shutil.rmtree(self._home, ignore_errors=True)
 
     def _environment(self) -> dict[str, str]:
-        """Return the worker's environment variables, which tell nothing about this process."""
+        """Return the worker's environment variables, without other variables of this process."""
         numeric = {name: value for name, value in os.environ.items()
                    if name.startswith(NUMERIC_ENV)}
         threads = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"), "1")
@@ -436,8 +435,8 @@ class Worker:
             CACHE_VARIABLE: str(cache_folder())} | (inside if self._is_confined else {})
 
     def _files(self, id: str, method: str) -> dict[str, np.ndarray]:
-        """Return the name of the method, the contents of its files, and an entry that only a
-        script has registered, as bytes."""
+        """Return as bytes the name of the method, the contents of its files, and the registry entry
+        of an environment that was registered at run time."""
         by_hand = [each for each in runtime_entries() if each.id == id]
         contents = {"method": str(method).encode(),
                     "entry": b"".join(map(cloudpickle.dumps, by_hand))}
@@ -452,7 +451,7 @@ class Worker:
 
     def _ask(self, do: str, arrays: Arrays | None = None, **header: Any,
              ) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-        """Return the reply to a request, one of the methods of `_MethodServer`."""
+        """Send a request, one of the methods of `_MethodServer`, and return the reply."""
         begin = time.monotonic()
         self._deadline = begin + self.reply_timeout
         try:
@@ -477,7 +476,7 @@ class Worker:
         return reply, received
 
     def _show(self, printed: str) -> None:
-        """Print what the method has printed, each line marked with its name."""
+        """Print the method's output, each line prefixed with its name."""
         if printed := printed[:self._left_chars].rstrip("\n"):
             lines = sanitize(printed, lines=True).replace("\n", f"\n[{self._name}] ")
             sys.stderr.write(f"[{self._name}] {lines}\n")
@@ -485,7 +484,7 @@ class Worker:
 
     def _send(self, message: bytes) -> None:
         left = memoryview(message)
-        while left:  # a worker that does not read leaves the pipe full
+        while left:  # the pipe stays full if the worker does not read
             self._wait([], [self._input])
             try:
                 left = left[os.write(self._input, left):]
@@ -503,7 +502,7 @@ class Worker:
         return bytes(parts)
 
     def _wait(self, readers: list[int], writers: list[int]) -> None:
-        """Return when a pipe is ready; check time, memory and number of threads meanwhile."""
+        """Wait until a pipe is ready, and check time, memory and number of threads meanwhile."""
         while True:
             now = time.monotonic()
             if now > self._deadline:
@@ -522,15 +521,15 @@ class Worker:
                               "processes and threads")
         if sum(_status(pid, "VmRSS") for pid in family) <= self._limits.memory:
             return
-        # VmRSS counts a page once for each process that shares it, Pss once in all.
+        # VmRSS counts a shared page once for each process, Pss once in total.
         if sum(_status(pid, "Pss", "smaps_rollup") or _status(pid, "VmRSS")
                for pid in family) > self._limits.memory:
             raise WorkerError("ResourceLimitError: it held more than "
                               f"{self._limits.memory >> 20} MiB")
 
     def _family(self) -> list[int]:
-        """Return the ids of the process and its descendants, of somewhat more than allowed at
-        most."""
+        """Return the ids of the process and its descendants; stop soon after the limit is
+        exceeded."""
         found: list[int] = []
         left = [self._process.pid]
         while left and len(found) <= self._limits.threads:
@@ -550,14 +549,14 @@ class Worker:
                            f"{self._process.returncode}, as after a crash or at a memory limit")
 
     def _kill(self) -> None:
-        """Kill the process and its children; under bubblewrap the kernel ends all of them."""
+        """Kill the process and its children; under bubblewrap the kernel ends all processes."""
         with suppress(ProcessLookupError, PermissionError):
             os.killpg(self._process.pid, signal.SIGKILL)
         self._process.wait()
 
 
 def _status(pid: int, field: str, file: str = "status") -> int:
-    """Return a number of a file of /proc/PID, bytes if it is a size; 0 if it is missing."""
+    """Return a number from a file of /proc/PID, a size in bytes; 0 if it is missing."""
     try:
         text = Path(f"/proc/{pid}/{file}").read_text(errors="replace")
     except OSError:
@@ -574,10 +573,10 @@ def _text(value: Any, length: int = 2000) -> str:
 
 
 def main() -> None:
-    """Serve one method on standard input and output until the other side closes them."""
+    """Serve one method on standard input and output until the parent process closes them."""
     incoming, outgoing = os.fdopen(os.dup(0), "rb"), os.fdopen(os.dup(1), "wb")
     null = os.open(os.devnull, os.O_RDWR)
-    for stream in range(3):  # what a method prints is not a reply
+    for stream in range(3):  # printed text must not mix with replies
         os.dup2(null, stream)
     _set_limits(Limits(*json.loads(sys.argv[1])))
     _copy_kernels()
@@ -610,7 +609,7 @@ def _set_limits(limits: Limits) -> None:
     import resource  # not on Windows
     most = {resource.RLIMIT_AS: limits.memory, resource.RLIMIT_FSIZE: limits.disk,
             resource.RLIMIT_NOFILE: 1024, resource.RLIMIT_CORE: 0}
-    if os.environ["HOME"] == "/tmp":  # else all processes of the user count
+    if os.environ["HOME"] == "/tmp":  # outside the sandbox all processes of the user would count
         most[resource.RLIMIT_NPROC] = limits.threads
     for kind, value in most.items():
         resource.setrlimit(kind, (value, value))
@@ -619,7 +618,7 @@ def _set_limits(limits: Limits) -> None:
 
 
 def _copy_kernels() -> None:
-    """Copy compiled kernels to where numba expects them; to compile them takes 20 s."""
+    """Copy compiled kernels to the folder in which numba expects them; compiling takes 20 s."""
     if "NUMBA_CACHE_DIR" not in os.environ:
         return
     source = PACKAGE / "numerics"
@@ -631,7 +630,7 @@ def _copy_kernels() -> None:
 
 
 class _MethodServer:
-    """The requests that a worker answers; each returns a header and arrays."""
+    """Requests that a worker answers; each method returns a header and arrays."""
 
     def __init__(self) -> None:
         self._file = Path()
@@ -640,11 +639,11 @@ class _MethodServer:
         self._instance: Any = None
 
     def load(self, header: dict[str, Any], arrays: Arrays) -> tuple[dict[str, Any], Arrays]:
-        """Load the method and return what its class reports about itself."""
+        """Load the method and return the attributes of its class."""
         import gymnasium as gym
         contents = {name: array.tobytes() for name, array in arrays.items()}
         method = contents["method"].decode()
-        if contents["entry"]:  # from the trusted side
+        if contents["entry"]:  # unpickling is safe: the parent process sent it
             import_entries([cloudpickle.loads(contents["entry"])])
         home = Path.home() / "method"
         home.mkdir()
@@ -688,5 +687,5 @@ class _MethodServer:
 
 
 def _sendable(text: str, length: int = MAX_OUTPUT_CHARS) -> str:
-    """Cut a text, and replace lone surrogates, which UTF-8 does not have."""
+    """Truncate a text, and replace lone surrogates, which UTF-8 cannot encode."""
     return text[:length].encode(errors="replace").decode()

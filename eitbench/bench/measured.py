@@ -1,4 +1,4 @@
-"""Run of an estimator on measurements: what is kept of it, and its scores."""
+"""Run of an estimator on measurements: stored results and scores."""
 
 from __future__ import annotations
 
@@ -29,30 +29,30 @@ class MeasuredRun:
 
     method: str
     steps: np.ndarray
-    """(S,) increasing t of the estimates that are kept"""
+    """(S,) increasing t of the stored estimates"""
     mean: np.ndarray
     """(S, n) mol/m³ at the nodes of the task's mesh"""
     variance: np.ndarray | None
-    """(S, n) (mol/m³)², NaN in states without one; None if the last state has none"""
+    """(S, n) (mol/m³)², NaN in states without a variance; None if the last state has none"""
     nis: np.ndarray
-    """(T,) νᵀS⁻¹ν relative to the number of readings shown; NaN if the method has no innovation"""
+    """(T,) νᵀS⁻¹ν relative to the number of visible measurements; NaN without an innovation"""
     withheld_residual_rms: np.ndarray
-    """(T,) RMS residual of withheld readings, relative to the noise; NaN where nothing is scored"""
+    """(T,) RMS residual of withheld measurements relative to the noise; NaN in unscored steps"""
     velocity: np.ndarray | None
-    """(T, k) m/s, parameters of the flow if estimated; nominal where the method has none"""
+    """(T, k) m/s, parameters of the flow if estimated; nominal if the method returns none"""
     frame_times: np.ndarray
-    """(C,) s, begin of some frames, evenly distributed"""
+    """(C,) s, start of some frames, evenly distributed"""
     electrode_residual_rms: np.ndarray
-    """(C, L) RMS residual in a frame of the readings with an electrode that carries current (if
-    there are none, of all with this electrode), relative to the noise, of the estimate before each
-    reading; for a target at rest, of the last estimate. NaN without any."""
+    """(C, L) RMS residual in a frame relative to the noise, over the measurements that involve the
+    electrode while it drives current (without any in all frames, over all that involve it), of
+    the estimate before each measurement; for a stationary target, of the last. NaN without any."""
     seconds_per_step: float
     withheld_rmse_volts: float = math.nan
     """V, RMS residual of all withheld readings that are scored"""
 
     @property
     def withheld_rmse(self) -> float:
-        """RMS residual of all withheld readings that are scored; 1 is the noise level, NaN without
+        """RMS residual of all scored withheld measurements relative to the noise; NaN without
         any."""
         return _root_mean(self.withheld_residual_rms**2)
 
@@ -66,8 +66,8 @@ class MeasuredRun:
     def collect(cls, env: MeasuredEnv, method: str,
                 steps: Iterable[tuple[int, Estimate | None, dict[str, np.ndarray], float]],
                 kept: Collection[int] | None = None) -> MeasuredRun:
-        """Collect (t, estimate, measurement, seconds) step by step; of the estimates only those at
-        the steps ``kept``, by default all."""
+        """Collect (t, estimate, measurement, seconds) step by step; store the estimates at the
+        steps ``kept``, by default all."""
         T, velocity = env.episode_steps, env.task.velocity
         residual, squares, nis = np.full((3, T), np.nan)
         theta = None if velocity is None else np.tile(velocity.nominal, (T, 1))
@@ -104,7 +104,7 @@ class MeasuredRun:
                    electrodes.rms(), seconds / T, _root_mean(squares))
 
     def outcome(self, env: MeasuredEnv) -> Outcome:
-        """Return what can be scored: withheld readings, innovations, and the truth of a case."""
+        """Return the data for scores: withheld residuals, NIS and the KTC score of a case."""
         truth = None if env.case is None else env.case.truth_mask()
         ktc = None
         if truth is not None:
@@ -135,7 +135,7 @@ def _root_mean(squares: np.ndarray) -> float:
 
 
 class _ElectrodeResiduals:
-    """Sums of squared residuals by electrode in some frames."""
+    """Sums of squared residuals for each electrode in some frames."""
 
     def __init__(self, env: MeasuredEnv) -> None:
         measurements = env.measurements
@@ -153,7 +153,7 @@ class _ElectrodeResiduals:
         self._squares, self._count = np.zeros((2, len(begins), L))
 
     def add(self, t: int, estimate: np.ndarray) -> None:
-        """Add the residuals of an estimate (n,) at t = 1 … T, if its frame is one of these."""
+        """Add the residuals of an estimate (n,) at t = 1 … T if its frame is selected."""
         if (row := self._row.get((t - 1) // self._frame)) is None:
             return
         counted = self._counted[self._env.measurements.injection_index[t - 1]]
@@ -167,7 +167,7 @@ class _ElectrodeResiduals:
 
 
 def plotted_steps(env: MeasuredEnv) -> set[int]:
-    """Return the steps whose estimates a page shows: evenly distributed, and the last."""
+    """Return the steps whose estimates a report shows: evenly distributed, and the last."""
     first = min(env.task.warm_up + 1, env.episode_steps)
     steps = np.linspace(first, env.episode_steps, N_PLOTTED_FRAMES).round().astype(int)
     return set(steps.tolist())
@@ -181,7 +181,7 @@ def _variances(estimates: list[Estimate]) -> np.ndarray | None:
 
 
 def _nis(env: MeasuredEnv, t: int, estimate: Estimate) -> float:
-    """NIS relative to the number of readings shown; hidden ones have an innovation of 0."""
+    """Return NIS relative to the number of visible measurements; hidden ones have innovation 0."""
     if estimate.innovation is None or estimate.innovation_covariance is None:
         return float("nan")
     known = np.isfinite(estimate.innovation)

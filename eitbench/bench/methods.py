@@ -1,4 +1,4 @@
-"""Methods, estimators and injection policies alike: find and load them, one Python file each."""
+"""Find and load methods (estimators and injection policies), one Python file each."""
 
 from __future__ import annotations
 
@@ -23,28 +23,28 @@ from eitbench._sanitize import error_location
 from eitbench.bench.tracks import SUBTRACKS, TRACKS
 
 METHOD_GROUP = "eitbench.methods"
-"""Entry points of installed packages: a method's name, and its module of that name."""
+"""Entry-point group of installed packages: a method's name, and its module of that name."""
 LOADER_GROUP = "eitbench.loaders"
-"""Entry points that load a policy from another kind of file: named by its suffix, called with path
-and content."""
+"""Entry-point group of functions that load a policy from another kind of file: each has the name of
+the file's suffix and is called with path and content."""
 ROLES = (None, "floor", "reference")
-"""Role of a method on a board: ranked, naive baseline, or oracle."""
+"""Role of a method on a leaderboard: ranked, naive baseline, or oracle."""
 
 AGENT_FILES = ("config.json", "sha256")
 """Files beside the model.zip of an agent."""
 MAX_METHOD_BYTES = 1 << 28
-"""of a method's file, which is read whole"""
+"""size of a method's file"""
 MAX_TITLE_CHARS = 120
-"""letters of a title"""
+"""length of a title"""
 MAX_PARAMETERS_BYTES = 10_000
-"""bytes of JSON that the parameters of a method may take in a record"""
+"""size of a method's parameters as JSON in a record"""
 AGENTS_NOT_BUNDLED = ("checkpoints of built-in agents are in a checkout only, not in an installed "
                       "package; --policy takes the path of a model.zip")
 
 
 class MethodKind(NamedTuple):
-    """Kind of the methods of a track: the word for it in messages, the class that a file defines,
-    its method, the accepted files, and the folder of built-in ones below `baseline_folder`."""
+    """Kind of the methods of a track: its word in messages, the class that a file defines, the
+    method of the class, the accepted files, and the built-in folder below `baseline_folder`."""
 
     kind: str
     type: str
@@ -65,15 +65,15 @@ class Method(NamedTuple):
     """A loaded method."""
 
     track: str
-    """One of `TRACKS`: whether it is an estimator or a policy."""
+    """One of `TRACKS`: estimators or policies."""
     name: str
-    """Name of the file without its suffix; of an agent, algorithm and seed."""
+    """Name of the file without its suffix; for an agent, algorithm and training seed."""
     title: str
     """First line of its docstring, up to a colon, bracket or full stop."""
     path: Path
     sha256: str
     subtracks: tuple[str, ...]
-    """Boards of its track that it can run on."""
+    """Subtracks of its track that it can run on."""
     parameters: dict[str, Any]
     make: Callable[..., Any]
     """Estimator(task), with update(voltages, currents) -> Estimate or None; or
@@ -81,17 +81,17 @@ class Method(NamedTuple):
     role: str | None = None
     """One of `ROLES`."""
     privileged: bool = False
-    """Whether it gets the ground truth: Estimator(task, revealed), with the episode's flow and
-    whole record; Policy(rules, random, core)."""
+    """True if it receives the ground truth: Estimator(task, revealed), with the flow and all
+    measurements of the episode; Policy(rules, random, core)."""
 
     @property
     def version(self) -> str:
-        """As `version_of`."""
+        """Version as defined by `version_of`."""
         return version_of(self.path, self.sha256)
 
     def suits(self, world: Any) -> bool:
-        """Return whether it can run on a `Task` of its boards, or under these `Rules`; without a
-        function ``suits`` a method suits all."""
+        """Return whether it is compatible with a `Task` of its subtracks, or with `Rules`; a method
+        without a function ``suits`` is compatible with all."""
         suits = getattr(self.make, "suits", None)
         return suits is None or bool(suits(world))
 
@@ -108,54 +108,54 @@ def builtin_methods(track: str) -> list[str]:
 
 
 def builtin_agents(id: str) -> list[str]:
-    """Return the paths of the built-in agents of an environment; none without the extra ``rl``, and
-    none, with a notice, where their models are missing."""
+    """Return the paths of the built-in agents of an environment: an empty list without the extra
+    ``rl`` or, with a notice, without their checkpoints."""
     if not importlib.util.find_spec("stable_baselines3"):
         return []
     agents = _agents(id)
     found = [str(path) for path in agents if path.is_file()]
     if agents and not found:
-        notify(f"our agents for {id} are left out: {AGENTS_NOT_BUNDLED}")
+        notify(f"built-in agents for {id} are skipped: {AGENTS_NOT_BUNDLED}")
     return found
 
 
 def builtin_files(id: str) -> dict[str, Path]:
-    """Map the name under which results are stored to the file, of each built-in method and of the
-    agents of an environment, whose models may be missing."""
+    """Map the names of results to the files of all built-in methods and of the agents of an
+    environment; checkpoints of agents may be missing."""
     folders = [baseline_folder() / form.folder for form in METHOD_KINDS.values()]
     return ({path.stem: path for folder in folders for path in sorted(folder.glob("*.py"))}
             | {f"{path.parents[1].name}_{path.parent.name}": path for path in _agents(id)})
 
 
 def _agents(id: str) -> list[Path]:
-    """``baselines/checkpoints/ENV/ALGO/seedK/model.zip``"""
+    """Return the paths ``baselines/checkpoints/ENV/ALGO/seedK/model.zip``."""
     folder = baseline_folder() / "checkpoints" / id.replace("/", "-")
     return [path.with_name("model.zip") for path in sorted(folder.glob("*/seed*/sha256"))]
 
 
 def builtin_sha256(path: Path) -> str:
-    """Return the sha256 of a built-in method's file; an agent's was written by its training."""
+    """Return the sha256 of a built-in method's file; for an agent it is in the file ``sha256``."""
     if path.suffix == ".py":
         return hashlib.sha256(path.read_bytes()).hexdigest()
     return path.with_name("sha256").read_text(encoding="ascii").strip()
 
 
 def is_builtin(name: str) -> bool:
-    """Return whether a method, by name or by path, is built in: it lies in our folder."""
+    """Return whether a method, given by name or path, is in the folder of built-in methods."""
     if is_path(name):
         return Path(name).resolve().is_relative_to(baseline_folder().resolve())
     return any(name in builtin_methods(track) for track in TRACKS)
 
 
 def is_path(name: str) -> bool:
-    """Return whether a method is given by the path of its file, as its suffix shows."""
+    """Return whether a method is given by the path of its file, which the suffix shows."""
     return Path(name).suffix in {".py", *_loaders()}
 
 
 @lru_cache(maxsize=1)
 def installed_methods() -> dict[str, Path]:
-    """Map name to file of each method of installed packages (entry points `METHOD_GROUP`). A method
-    that has a built-in name, or no file, is left out with a warning."""
+    """Map names to files of the methods of installed packages (entry points `METHOD_GROUP`). A
+    method with a built-in name, or without a file, is skipped with a warning."""
     found = {}
     for point in entry_points(group=METHOD_GROUP):
         try:
@@ -164,8 +164,8 @@ def installed_methods() -> dict[str, Path]:
             specification = None
         path = Path(specification.origin) if specification and specification.origin else None
         if is_builtin(point.name) or path is None or path.stem != point.name:
-            warnings.warn(f"method {point.name} of {point.value} is left out: it must be a module "
-                          "of that name, and none of ours may have it", stacklevel=2)
+            warnings.warn(f"method {point.name} of {point.value} is skipped: it must be a module "
+                          "of that name, and differ from built-in names", stacklevel=2)
         else:
             found[point.name] = path
     return found
@@ -173,7 +173,7 @@ def installed_methods() -> dict[str, Path]:
 
 @lru_cache(maxsize=1)
 def _loaders() -> dict[str, EntryPoint]:
-    """Map suffixes to loaders."""
+    """Map file suffixes to the entry points of loaders."""
     return {f".{point.name}": point for point in entry_points(group=LOADER_GROUP)}
 
 
@@ -184,14 +184,14 @@ def loader_of(path: Path) -> str:
 
 
 def version_of(path: Path, sha256: str) -> str:
-    """Return the version that records name: of a built-in method that of its golden file, of others
-    eight digits of their file's sha256."""
+    """Return the version of a method in records: for a built-in method the version of its golden
+    file, for others eight digits of the sha256 of its file."""
     return f"v{golden_version(golden_name(path))}" if is_builtin(str(path)) else sha256[:8]
 
 
 def golden_name(path: Path) -> str:
-    """Return the name of a built-in method's golden file: that of its file; agents of one
-    environment and algorithm share one."""
+    """Return the name of a built-in method's golden file: the name of its file; agents of one
+    environment and algorithm share a golden file."""
     folders = path.resolve().parents
     return path.stem if path.suffix == ".py" else f"{folders[2].name}--{folders[1].name}"
 
@@ -206,10 +206,10 @@ def golden_version(name: str) -> int:
 
 
 def method_files(path: Path) -> dict[str, bytes]:
-    """Map names to contents of the files of a method: its own, first, those that its class names in
+    """Map names to contents of the files of a method: the own, first, those that its class names in
     ``files = ("weights.npz",)``, and those that `eitbench.rl.save_agent` writes with a model.
 
-    The source is parsed, not executed. ``ValueError`` if a named file is not in the folder."""
+    The source is parsed, not executed. ``ValueError`` if a named file is not in its folder."""
     source = path.read_bytes()
     if path.suffix != ".py":
         return {path.name: source} | {name: path.with_name(name).read_bytes()
@@ -278,15 +278,15 @@ def find_method(name: str, track: str) -> Path:
     if path.stat().st_size > MAX_METHOD_BYTES:
         raise ValueError(f"{form.kind} {path} must have {MAX_METHOD_BYTES >> 20} MiB at most")
     if path.stem in own and not path.samefile(folder / f"{path.stem}.py"):
-        raise ValueError(f"{form.kind} {path} has the name of one of ours, under which results are "
-                         "kept; rename it")
+        raise ValueError(f"{form.kind} {path} has the name of a built-in method, under which "
+                         "results are stored; rename it")
     return path
 
 
 def load_method(name: str, track: str) -> Method:
-    """Load a method as `find_method`; a trained agent by the path of its model.zip.
-    ``ValueError`` if there is none, its file has no class as its track requires, or an agent's file
-    is not the one that its training wrote."""
+    """Load the method that `find_method` returns; a trained agent by the path of its model.zip.
+    ``ValueError`` if it is missing, its file lacks the class that its track requires, or an agent's
+    file was changed after its training."""
     path = find_method(name, track)
     contents = method_files(path)
     return _load(path, contents[path.name], method_sha256(contents), track)
@@ -294,7 +294,7 @@ def load_method(name: str, track: str) -> Method:
 
 @lru_cache(maxsize=64)
 def _load(path: Path, source: bytes, sha256: str, track: str) -> Method:
-    """Load the file with this content, which is executed once a process."""
+    """Load the file with this content, which is executed once per process."""
     form = METHOD_KINDS[track]
     if track == "injection" and path.suffix in _loaders():
         name, title, agent, parameters = _loaders()[path.suffix].load()(path, source)
@@ -311,7 +311,7 @@ def _load(path: Path, source: bytes, sha256: str, track: str) -> Method:
 
 def method_from_class(method: type[Any], track: str, name: str, where: str = "") -> Method:
     """Return a class as a method of a track, without a file. ``ValueError``, naming ``where`` it is
-    (default: its name), if it is not as the track requires."""
+    defined (default: its name), if it does not meet the requirements of the track."""
     form = METHOD_KINDS[track]
     who = f"{form.kind} {where or name}: {method.__name__}"
     if not callable(getattr(method, form.interface.partition("(")[0], None)):
@@ -323,7 +323,7 @@ def method_from_class(method: type[Any], track: str, name: str, where: str = "")
                          f"{subtracks!r}")
     role = getattr(method, "role", None)
     if role not in ROLES:
-        raise ValueError(f"{who}.role must be None, 'floor' or 'reference', got {role!r}")
+        raise ValueError(f"{who}.role must be among {', '.join(map(repr, ROLES))}; got {role!r}")
     privileged = getattr(method, "privileged", False)
     if not isinstance(privileged, bool):
         raise ValueError(f"{who}.privileged must be True or False, got {privileged!r}")
@@ -342,7 +342,7 @@ def load_module(kind: str, path: Path, source: bytes) -> ModuleType:
     module = importlib.util.module_from_spec(specification)
     sys.modules[name] = module  # dataclasses look their module up
     try:
-        # a cached .pyc may lag behind an edit by a second
+        # not a cached .pyc, which may be outdated within a second after an edit
         exec(compile(source, path, "exec"), module.__dict__)
     except Exception as error:
         where = "" if isinstance(error, SyntaxError) else f" ({error_location(error, path)})"

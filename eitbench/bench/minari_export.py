@@ -23,26 +23,26 @@ if TYPE_CHECKING:
 
 DESCRIPTION = """\
 {env}: process tomography in which an agent chooses every injection. Policy {policy}: {title}. \
-Episodes {seeds}; the seed of each is in its metadata, and with it and the actions the environment \
-gives the same observations and rewards again. Observations are scaled, as \
-eitbench.envs.injection_core.flatten_scaled says; rewards are the difference between the relative \
-squared errors of the best constant and of the estimate, zero in states that are not scored. \
+Episodes {seeds}; the metadata of an episode holds its seed, with which the actions reproduce \
+observations and rewards. Observations are scaled as documented in \
+eitbench.envs.injection_core.flatten_scaled; a reward is the relative squared error of the best \
+constant estimate minus the relative squared error of the estimate, and zero in states that are \
+not scored. \
 Simulated by eitbench {version}; no measured data, no personal data. Licence: MIT. {warning}"""
 
 
 def export_minari(name: str, env: str, policy: str, seeds: str | Sequence[int], *,
                   n_jobs: int = 1, backend: str = "loky") -> int:
-    """Run a policy, write its episodes where Minari finds them, and return their number.
+    """Run a policy, write its episodes to Minari's data folder, and return their number.
 
-    All are written at the end: an interrupted export leaves nothing but simulated episodes in the
-    cache, and starts again.
+    All episodes are written at the end: an interrupted export leaves only cached simulated
+    episodes, and must be started again.
 
-    ``name`` is that of the data set, as in ``eitbench/pipe2d/random-pair-v0``; ``env`` the id of an
-    injection environment; ``policy`` a built-in name, or the path of a file, which runs in this
-    process; ``seeds`` as of `eitbench.dataset`, ``n_jobs`` and ``backend`` of
+    ``name`` is the name of the data set, e.g. ``eitbench/pipe2d/random-pair-v0``; ``env`` the id of
+    an injection environment; ``policy`` a built-in name, or the path of a file, which runs in this
+    process; ``seeds`` as in `eitbench.dataset`, ``n_jobs`` and ``backend`` as in
     `eitbench.data.presimulation.presimulate`. ``ValueError`` for an unknown environment, policy or
-    seed, a policy
-    that does not suit the environment, or a name that is malformed or taken.
+    seed, an incompatible policy, or a malformed or existing name.
     """
     with require_extra("format minari"):
         from minari import create_dataset_from_buffers
@@ -56,8 +56,8 @@ def export_minari(name: str, env: str, policy: str, seeds: str | Sequence[int], 
         raise ValueError(f"policy must suit env, got {policy!r}, which does not")
     presimulate(inner.world, numbers, n_jobs=n_jobs, backend=backend)
     episodes = [_run(made, method, seed, k) for k, seed in enumerate(
-        tqdm(numbers, desc="playing", unit="episode", disable=None))]
-    # by its id: the spec of one that is made knows its length, and would be truncated there too
+        tqdm(numbers, desc="running", unit="episode", disable=None))]
+    # the id: the spec of an environment that was made has an episode limit, which would truncate
     create_dataset_from_buffers(name, episodes, env=env, algorithm_name=method.name,
                                 author="eitbench", requirements=["eitbench"],
                                 description=_description(env, method, numbers))

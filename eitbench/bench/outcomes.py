@@ -1,4 +1,4 @@
-"""Outcomes of episodes, to be scored on the truth's mesh (``docs/methods.md``, 4)."""
+"""Outcomes of episodes, which are scored on the truth mesh (``docs/methods.md``, 4)."""
 
 from __future__ import annotations
 
@@ -34,9 +34,9 @@ class EstimatorOutput:
     innovations: dict[int, tuple[np.ndarray, np.ndarray]]
     """measurement i -> (ν, S)"""
     seconds: np.ndarray
-    """of each update; the first includes the constructor"""
+    """time of each update; the first includes the constructor"""
     velocities: np.ndarray
-    """(T, k) parameters of the flow in m/s; k = 0 where it is known"""
+    """(T, k) parameters of the flow in m/s; k = 0 if the task specifies the flow"""
 
     @classmethod
     def collect(
@@ -62,7 +62,7 @@ class EstimatorOutput:
                 if estimate.velocity is not None:
                     velocities[t - 1] = estimate.velocity
             if estimate.innovation is not None and estimate.innovation_covariance is not None:
-                # copies, as means are: arrays get reused
+                # copies: a method may reuse its arrays
                 innovations[t + task.lag] = (
                     np.array(estimate.innovation, dtype=float),
                     np.array(estimate.innovation_covariance, dtype=float))
@@ -73,7 +73,7 @@ class EstimatorOutput:
                    np.array(seconds), velocities)
 
     def fields(self) -> dict[str, np.ndarray]:
-        """Return means and standard deviations as float32, for pictures."""
+        """Return means and standard deviations as float32, for figures."""
         fields = {"mean": self.means.astype(np.float32)}
         if self.variances is not None:
             fields["std"] = np.sqrt(self.variances).astype(np.float32)
@@ -101,7 +101,7 @@ def estimation_outcome(env: EstimationEnv, said: EstimatorOutput) -> Outcome:
     if task.velocity is not None:
         velocity = (said.velocities[states] @ task.velocity.profiles.T,
                     env.true_velocity()[states], task.velocity.weights)
-    # all of them or none: one step that fits can be chosen
+    # all steps or none: a method must not select the steps that fit
     steps = range(task.warm_up + 1, task.n_steps + 1)
     innovations = None
     if all(i in said.innovations for i in steps):
@@ -126,7 +126,7 @@ class ScoredEstimate(NamedTuple):
     std: np.ndarray
     """(n,) mol/m³"""
     innovation: Innovation | None
-    """of the accepted readings; None if there are none"""
+    """of the accepted measurements; None if all were rejected"""
 
 
 def injection_outcome(world: World, seed: int, estimates: list[ScoredEstimate],

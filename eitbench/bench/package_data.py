@@ -1,5 +1,5 @@
-"""The files that the package ships so that built-in worlds start fast: scoring constants, reduced
-models, and the first steps of the first training episode."""
+"""Precomputed files of the package, with which built-in worlds start fast: scoring constants,
+reduced models, and the first steps of the first training episode."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from eitbench.estimation.onboard.models import build_packed_model, reduced_model
 from eitbench.worlds.registry import Entry, entries, entry
 
 ARRAY_TOLERANCE = 1e-5
-"""Accepted difference relative to an array's largest entry: models are kept in single precision."""
+"""Accepted difference relative to an array's largest entry: models are in single precision."""
 
 
 def expected_files(ids: Iterable[str]) -> list[File]:
-    """Return the files that these ids need, each once."""
+    """Return the files that these ids need, without duplicates."""
     files = {file.key: file for id in ids for file in _files(entry(id))}
     return list(files.values())
 
@@ -37,18 +37,18 @@ def _files(registered: Entry) -> Iterator[File]:
 
 
 def _needed_steps(registered: Entry) -> int:
-    """Return the steps of an episode that the first observation needs."""
+    """Return the number of steps of an episode that the first observation needs."""
     return 1 + (registered.track == "injection") * len(registered.world.currents)
 
 
 def write_package_data(ids: Iterable[str] = ()) -> Iterator[tuple[str, str]]:
-    """Rebuild the shipped files of built-in ids (default: all), in five minutes, write the missing
-    ones and compare the others.
+    """Rebuild the shipped files of built-in ids (default: all), in five minutes; write the missing
+    files and compare the others, which are not changed.
 
     Yields
     ------
     name, result
-        ``result`` is ``new``, ``same`` or the difference, and then the file stays as it is.
+        ``result`` is ``new``, ``same`` or the difference.
     """
     for file in expected_files(ids or builtin_ids()):
         built = file.build()
@@ -66,10 +66,10 @@ def unused_files() -> list[str]:
 
 
 def difference(shipped: Arrays | None, built: Arrays) -> str:
-    """Return how shipped arrays differ from those built now; empty within `ARRAY_TOLERANCE`.
+    """Describe the difference of shipped and rebuilt arrays; empty within `ARRAY_TOLERANCE`.
 
-    Another processor may choose another basis of the same space: models are compared in one. It
-    may also round to zero other entries of a sparse matrix.
+    The basis of a model's space and the entries of a sparse matrix that are rounded to zero may
+    depend on the processor: models are compared in one basis, matrices as dense arrays.
     """
     if shipped is None:
         return "missing or damaged"
@@ -90,7 +90,7 @@ def difference(shipped: Arrays | None, built: Arrays) -> str:
 
 
 def _dense(arrays: Arrays) -> Arrays:
-    """Return an outline or region mass with its matrix as one dense array."""
+    """Return scoring constants or a region's mass with the matrix as one dense array."""
     return {"mass": csr_of(arrays).toarray()} | {
         name: array for name, array in arrays.items() if name == "largest"}
 

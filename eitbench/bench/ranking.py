@@ -1,4 +1,4 @@
-"""Shared ranks: the number of methods that are significantly better than each."""
+"""Shared ranks, from the number of methods that are significantly better than a method."""
 
 from __future__ import annotations
 
@@ -23,24 +23,24 @@ def shared_ranks(scores: Mapping[str, Scores], unranked: Collection[str] = (), *
     """Rank methods that ran on the same episodes: 1 + the number of ranked methods that are
     significantly better.
 
-    A method is significantly better if the interval of the `paired_difference` lies on the better
-    side of zero. Rank 1 thus means that no method was shown to be better, rank 3 that two were, and
-    they can be named. A method with too few episodes to be compared costs no other a rank.
+    A method is significantly better if the interval of the `paired_difference` excludes zero on the
+    better side. Rank 1 means that no method is significantly better, rank 3 that two are. A method
+    with too few episodes for an interval does not affect the ranks of others.
 
-    "Cannot be told apart" is not transitive: a and b may be so, and b and c, and still a is better
-    than c. No ranking then gives one rank to exactly those that cannot be told apart; this one
-    gives a and b rank 1 and c rank 2. Nor need ranks rise along the statistic: a method of
-    scattered scores may have a worse mean than one of rank 2 and still have rank 1. Each comparison
-    is at 95 %, without correction for the number of comparisons.
+    The absence of a significant difference is not transitive: it may hold for a and b, and for b
+    and c, while a is significantly better than c; a and b then have rank 1 and c rank 2. Ranks need
+    not increase with the statistic: a method whose scores vary much may have a worse mean than a
+    method of rank 2 and still have rank 1. Each comparison is at 95 %, without correction for the
+    number of comparisons.
 
     Parameters
     ----------
     scores : method -> environment -> seed -> score
-        In the same environments, and on the same seeds in each, for all.
+        Environments and seeds must be the same for all methods.
     unranked : collection of str
-        Methods without a rank that do not count for the others, such as privileged ones.
+        Methods without a rank that do not affect the ranks of others, such as privileged ones.
     statistic : callable
-        The statistic that is compared and that orders the methods; as in `stratified_bootstrap`.
+        Statistic to compare and order the methods, as in `stratified_bootstrap`.
     n_resamples, seed
         As in `stratified_bootstrap`.
 
@@ -65,7 +65,7 @@ def shared_ranks(scores: Mapping[str, Scores], unranked: Collection[str] = (), *
     if not has_enough_episodes(next(iter(strata.values()))):
         return ranks | dict.fromkeys(ranked, 1)
     cut = tail_percent(tuple(map(len, next(iter(strata.values())))))
-    # the same resamples for all: a paired difference is that of two rows
+    # all methods have the same resamples, so the difference of two rows is paired
     drawn = {method: sign * resample(strata[method], statistic, n_resamples, seed)
              for method in ranked}
     for method in ranked:

@@ -1,13 +1,11 @@
-"""Records: the scores of one version of a method in one environment, as JSON that can be repeated.
+"""Records: the reproducible scores of one version of a method in one environment, as JSON.
 
-A record names the version of a method, the version of a world (the -vN of its id), the seeds, and
-the scores of each episode. Numbers decide; commit and machine stand beside each run and decide
-nothing.
+A record holds the version of a method, the version of a world (the -vN of its id), the seeds, and
+the scores of each episode. Commit and machine of each run are informative only.
 
 The format is published in ``leaderboards/schema.json``, and a record is checked against it when it
-is written and when it is read. It carries the sha256 of its own content, so that a number changed
-by hand is noticed. That guards against accidents; whether a self-reported number is true is found
-out by running the method again.
+is written and when it is read. The record includes the sha256 of its content, which reveals
+accidental changes. Self-reported numbers are verified by rerunning the method.
 
 An installed package holds the scores of all published records in one table
 (`eitbench.bench.episode_table`) in place of the records.
@@ -43,13 +41,13 @@ SCHEMA = 3
 BOARDS = tracks.ALL_SUBTRACKS
 COMMON_FIELDS = ("board", "title", "parameters", "role", "privileged", "version", "method_sha256",
           "checkpoint_sha256")
-"""Fields that all episodes of a record have in common, beside environment and method."""
+"""Fields that all episodes of a record share, in addition to environment and method."""
 MAX_BYTES = 2**23
-"""of a file"""
+"""size of a file"""
 MAX_DEPTH = 32
-"""levels of lists and objects within each other"""
+"""levels of nested lists and objects"""
 MAX_KWARGS_CHARS = 10_000
-"""of an environment's arguments as JSON, which become headings"""
+"""length of an environment's arguments as JSON, which become headings"""
 _BUILTIN_VERSION = re.compile(r"v([1-9][0-9]*)")
 
 
@@ -76,13 +74,13 @@ def read_record(path: Path) -> dict[str, Any]:
     """Read one record.
 
     ``ValueError``, naming file and fields, if it cannot be read, breaks the schema, was changed
-    since it was written, or has another name than its content requires.
+    after it was written, or its name differs from the name that its content requires.
     """
     try:
         record = read_json(path)
         check_record(record)
         if record["sha256"] != _digest(record):
-            raise ValueError("was changed since it was written: its sha256 is not that of its "
+            raise ValueError("was changed since it was written: its sha256 does not match its "
                              "content")
         if path.name != record_file_name(record):
             raise ValueError(f"must have the name {record_file_name(record)}, as its content "
@@ -93,8 +91,8 @@ def read_record(path: Path) -> dict[str, Any]:
 
 
 def read_json(path: Path) -> Any:
-    """Read the JSON of a file; ``ValueError``, without the file's name, if it is too large, too
-    deep, not UTF-8, or has a number that is not finite (NaN, Infinity, 1e999)."""
+    """Read the JSON of a file; ``ValueError``, without the file's name, if it is too large, nested
+    too deeply, not UTF-8, or has a number that is not finite (NaN, Infinity, 1e999)."""
     try:
         status = os.stat(path)
         if not stat.S_ISREG(status.st_mode) or status.st_size > MAX_BYTES:
@@ -107,14 +105,14 @@ def read_json(path: Path) -> Any:
 
 
 def read_records(folder: Path, *, keep: Callable[[dict[str, Any]], Any] = dict) -> list[Any]:
-    """Read all records of a folder, by file name; none if there is no such folder. Records of an
-    environment that is not registered in that version are left out with a warning. ``keep`` may
-    reduce each record as soon as it is read.
+    """Read all records of a folder, sorted by file name; an empty list if the folder is missing.
+    Records of an environment that is not registered in that version are skipped with a warning.
+    ``keep`` may reduce each record as soon as it is read.
 
-    Where there is no folder, but the table of its episodes lies beside it, as in an installed
-    package, the records are those of the table, without runs and errors of single steps.
+    If the folder is missing, but the table of its episodes exists next to it, as in an installed
+    package, the records come from the table, without runs and errors of single steps.
 
-    ``ValueError``, naming all of them, if some are not valid; see `read_record`.
+    ``ValueError``, naming all invalid records; see `read_record`.
     """
     folder = Path(folder)
     if not folder.is_dir() and (table := table_path(folder)).is_file():
@@ -127,8 +125,8 @@ def read_records(folder: Path, *, keep: Callable[[dict[str, Any]], Any] = dict) 
 
 def read_valid_files(folder: Path, *, keep: Callable[[dict[str, Any]], Any] = dict,
                      measured: bool = False) -> tuple[dict[Path, Any], list[str]]:
-    """Read the valid records of a folder, by path, and a sentence for each other file that names
-    it; with ``measured`` only records of measured cases, else only others."""
+    """Return path -> record for the valid records of a folder, and an error message for each other
+    file; with ``measured`` only for records of measured cases, else only for others."""
     kept = {}
     complaints = []
     known = set(tracks.measured_ids() if measured else tracks.ids())
@@ -144,13 +142,13 @@ def read_valid_files(folder: Path, *, keep: Callable[[dict[str, Any]], Any] = di
         if id in known:
             kept[path] = keep(record)
         else:
-            warnings.warn(f"record {sanitize(str(path))} is left out: there is no environment "
+            warnings.warn(f"record {sanitize(str(path))} is left out: unknown environment "
                           f"{sanitize(id)}", stacklevel=3)
     return kept, complaints
 
 
 def record_file_name(record: dict[str, Any]) -> str:
-    """Return the name of a record's file; see `tracks.record_name`."""
+    """Return the file name of a record; see `tracks.record_name`."""
     return tracks.record_name(record["environment"]["name"], record["method"], record["version"],
                               record["split"])
 
@@ -161,7 +159,7 @@ def with_content_hash(record: dict[str, Any]) -> dict[str, Any]:
     try:
         content = json.loads(_json(content))
         return content | {"sha256": _digest(content)}
-    # NaN, or an object that JSON does not have, or too deep
+    # NaN, a type that JSON does not have, or too deep
     except (TypeError, ValueError, RecursionError) as error:
         raise ValueError(f"record cannot be written as JSON: {error}") from None
 
@@ -172,8 +170,8 @@ def _digest(record: dict[str, Any]) -> str:
 
 
 def _text(record: dict[str, Any]) -> str:
-    """JSON with sorted keys, a line for each field, episode and run, so that changes can be
-    read."""
+    """Format JSON with sorted keys and one line for each field, episode and run, which makes
+    differences readable."""
     lines = []
     for key, value in sorted(record.items()):
         if key in ("episodes", "runs"):
@@ -196,17 +194,17 @@ def split_of(seed: str) -> str:
 
 
 def version_number(version: str) -> int | None:
-    """Return 3 for ``v3``, a version of a built-in method; None for the digits of a file's hash."""
+    """Return 3 for ``v3``, the version of a built-in method; None for the digits of a hash."""
     return int(version[1:]) if _BUILTIN_VERSION.fullmatch(version) else None
 
 
 def finished_at(record: dict[str, Any]) -> str:
-    """Return the time of its last episode, in UTC as ISO 8601."""
+    """Return the time at which its last episode finished, in UTC as ISO 8601."""
     return max(episode["finished"] for episode in record["episodes"])
 
 
 def group_runs(runs: Iterable[dict[str, Any]], *keys: str) -> list[list[dict[str, Any]]]:
-    """Group runs by code, these ``keys`` and machine, whose matrix product each process times."""
+    """Group runs by code, ``keys`` and machine, without the time of the matrix product."""
     groups: dict[str, list[dict[str, Any]]] = {}
     for run in runs:
         machine = {key: value for key, value in run["machine"].items() if key != "matmul_seconds"}
@@ -218,17 +216,17 @@ def group_runs(runs: Iterable[dict[str, Any]], *keys: str) -> list[list[dict[str
 
 def split_outdated(records: list[dict[str, Any]],
                    ) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
-    """Separate records that may stand on a board together from outdated ones, each in the given
-    order.
+    """Separate current records, which a leaderboard shows together, from outdated ones; both keep
+    the given order.
 
-    Of one environment, split and built-in method only the highest version is current. An official
-    record is outdated only by a higher official one. Versions of third-party methods, which are not
-    ordered, stand side by side.
+    For each environment, split and built-in method only the highest version is current. An official
+    record is superseded only by a higher official one. All versions of third-party methods, which
+    have no order, are current.
     """
     highest: dict[tuple[Any, ...], int] = {}
     for record in records:
         number = version_number(record["version"]) or 0
-        # an official version counts for all, another for those that are not official
+        # an official version supersedes all records, another version only unofficial ones
         for official in {False, record["official"]}:
             key = (*_lineage(record), official)
             highest[key] = max(highest.get(key, 0), number)
@@ -242,7 +240,7 @@ def split_outdated(records: list[dict[str, Any]],
 
 
 def _lineage(record: dict[str, Any]) -> tuple[str, ...]:
-    """Return the fields that all versions of one method have in common."""
+    """Return the fields that all versions of one method share."""
     return record["environment"]["name"], record["method"], record["split"]
 
 
@@ -260,7 +258,7 @@ def _validator() -> Any:
 
 
 def check_record(record: Any) -> None:
-    """Raise ``ValueError``, naming fields, if a record breaks the schema or contradicts itself."""
+    """Raise ``ValueError``, naming fields, if a record breaks the schema or is inconsistent."""
     if not _validator().is_valid(record):
         errors = islice(_validator().iter_errors(record), 20)
         wrong = sorted(f"{_place(error.instance_path)}: {_shortened(error.message)}"
@@ -272,7 +270,7 @@ def check_record(record: Any) -> None:
 
 
 def _place(path: Iterable[str | int]) -> str:
-    """Format as in $.episodes[0].scores."""
+    """Format the path of a field, e.g. $.episodes[0].scores."""
     return "$" + "".join(f"[{key}]" if isinstance(key, int) else f".{key}" for key in path)
 
 
@@ -281,14 +279,14 @@ def _shortened(message: str) -> str:
 
 
 def _contradictions(record: dict[str, Any]) -> Iterator[str]:
-    """Yield a sentence, beginning with the field, for each rule that relates fields to each other
-    or to the environment, which a schema cannot express."""
+    """Yield a sentence, starting with the field, for each violated rule that relates fields to each
+    other or to the environment, which a schema cannot express."""
     yield from _of_the_environment(record)
     version = record["version"]
     if version_number(version) is None and version != record["method_sha256"][:8]:
-        yield "$.version: must be v1, v2, … of ours, or begin as method_sha256 does"
+        yield "$.version: must be v1, v2, … or the first eight digits of method_sha256"
     if record["official"] and any(run["commit"] is None or run["dirty"] for run in record["runs"]):
-        yield "$.official: must be false where a run was not of a commit without changes"
+        yield "$.official: must be false unless all runs are of a commit without changes"
     yield from _of_the_seeds(record)
     yield from _of_the_episodes(record)
 
@@ -302,7 +300,7 @@ def _of_the_environment(record: dict[str, Any]) -> Iterator[str]:
         yield f"$.environment.name: must be {name}, as id and kwargs require"
     if len(json.dumps(kwargs)) > MAX_KWARGS_CHARS:
         yield f"$.environment.kwargs: must have {MAX_KWARGS_CHARS} characters at most"
-    if id not in tracks.ids():                        # the record will be left out
+    if id not in tracks.ids():                        # the record will be skipped
         return
     try:
         boards = tracks.subtracks_of(id, kwargs)
@@ -315,17 +313,17 @@ def _of_the_environment(record: dict[str, Any]) -> Iterator[str]:
 
 def _of_the_seeds(record: dict[str, Any]) -> Iterator[str]:
     if record["seeds"] != [episode["seed"] for episode in record["episodes"]]:
-        yield "$.seeds: must be those of the episodes, in their order"
+        yield "$.seeds: must be the seeds of the episodes, in the same order"
     for seed in record["seeds"]:
         if not _is_seed(seed):
-            yield f"$.seeds: {sanitize(seed)[:40]!r} names no episode"
+            yield f"$.seeds: {sanitize(seed)[:40]!r} is not an episode seed"
     if {split_of(seed) for seed in record["seeds"]} != {record["split"]}:
         yield f"$.seeds: must all be of the split {record['split']}"
 
 
 @lru_cache(maxsize=2**14)
 def _is_seed(seed: str) -> bool:
-    """Return whether a seed lies within its split and is written as `format_seed` does."""
+    """Return whether a seed is within its split and has the form of `format_seed`."""
     try:
         return format_seed(parse_seeds(seed)[0]) == seed
     except ValueError:

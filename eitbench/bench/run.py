@@ -1,4 +1,4 @@
-"""Run methods on environments over seeds; each episode's result is stored when it is finished."""
+"""Run methods on environments and seeds; the result of each episode is stored when it finishes."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ class Job(NamedTuple):
     """Name or path."""
     seed: int
     isolation: str = "none"
-    """``none``, or the kind of worker in which alone the method's file is executed: ``process`` or
+    """``none``, or the kind of worker process that executes the method's file: ``process`` or
     ``bubblewrap``."""
 
     def load(self) -> Method:
@@ -66,9 +66,9 @@ class Job(NamedTuple):
             return load_method(self.method, track)
 
     def identity(self) -> str:
-        """Return a digest of the configuration and declared versions that the outcome depends on; a
-        stored result counts only for the very same. The method is not loaded. ``ValueError`` if
-        there is no such method or environment."""
+        """Return a digest of the configuration and declared versions that determine the outcome; a
+        stored result is reused only if the digests are equal. The method is not loaded.
+        ``ValueError`` for an unknown method or environment."""
         path = find_method(self.method, self.environment.track)
         contents = method_files(path)
         files = {name: hashlib.sha256(content).hexdigest() for name, content in contents.items()
@@ -94,7 +94,7 @@ def run_episode(job: Job) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     """Run and score one episode.
 
     Returns its result, JSON-ready (status "ok" with scores and the error of every scored step, or
-    "failed" with a message, file and line, and the traceback of the method's own code), and the
+    "failed" with a message, file and line, and the traceback of the method's file), and the
     estimates' means and standard deviations (float32; empty for policies and after a failure).
     """
     method = job.load()
@@ -108,10 +108,10 @@ def run_episode(job: Job) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
         scores = {"scores": numbers, "step_errors": played.outcome.errors.tolist()}
         if played.actions is not None:
             scores["actions"] = played.actions
-        json.dumps(scores, allow_nan=False)  # what cannot be stored is a failure of the method
+        json.dumps(scores, allow_nan=False)  # a result that cannot be stored is a failure
         result |= {"status": "ok"} | scores
         fields = played.fields
-    # an error of a method is its result
+    # an exception of a method becomes its result
     except (Exception, SystemExit) as error:
         result |= _failure_result(error, method.path)
     if job.isolation != "none":
@@ -121,7 +121,7 @@ def run_episode(job: Job) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
 
 
 def _initial_result(job: Job, method: Method) -> dict[str, Any]:
-    """Return the fields of a result that are known before the episode runs."""
+    """Return the fields of a result that do not depend on the episode's run."""
     asked = job.environment
     own = ("title", "parameters", "role", "privileged", "version")
     return {
@@ -148,24 +148,24 @@ def _failure_result(error: BaseException, own: Path) -> dict[str, Any]:
 
 def run_jobs(jobs: list[Job], store: EpisodeStore, *, n_jobs: int = 1, backend: str = "loky",
              command: str = "", keep_estimates: bool = True) -> None:
-    """Run all jobs that ``store`` does not hold yet, in ``n_jobs`` processes with one BLAS thread
-    each, and store each episode when it is finished.
+    """Run all jobs without a result in ``store``, in ``n_jobs`` processes with one BLAS thread
+    each, and store each episode when it finishes.
 
-    Clusters (``backend``, see `eitbench.data.parallel.run_parallel`) need the folders of ``store``
-    and cache on all machines. Results name ``command``, without folders.
+    On clusters (``backend``, see `eitbench.data.parallel.run_parallel`) all machines must share the
+    folders of ``store`` and cache. Results include ``command``, without folders.
     """
     todo = [job for job in jobs if not store.has_result(job.environment.name, job.load().name,
                                                         job.seed, job.identity())]
     if len(todo) < len(jobs):
-        tqdm.write(f"{len(jobs) - len(todo)} of {len(jobs)} episodes are already there")
+        tqdm.write(f"{len(jobs) - len(todo)} of {len(jobs)} episodes are already stored")
     if not todo:
         return
-    truths: dict[Any, Job] = {}  # each is simulated once, before several methods need it
+    truths: dict[Any, Job] = {}  # each is simulated once, before any method runs
     for job in (job for job in todo if not is_measured(job.environment.id)):
         truths.setdefault((cached_environment(job.environment).world, job.seed), job)
     run = {"command": portable_command(command), **provenance(), "machine": machine()}
     home = platform.node()
-    isolation.close()                               # that of `Job.load`; the workers have their own
+    isolation.close()                               # the worker that `Job.load` started
     try:
         for function, work, label in (
             (_simulate_job, [(job,) for job in truths.values()], "simulating truths"),
@@ -182,8 +182,8 @@ def run_jobs(jobs: list[Job], store: EpisodeStore, *, n_jobs: int = 1, backend: 
 
 def successful_results(jobs: Iterable[Job],
                results: Iterable[dict[str, Any]]) -> dict[Job, dict[str, Any]]:
-    """Map the jobs that have one to their first successful result: of the same environment, method,
-    version and seed, by any code."""
+    """Map jobs to their first successful result, with the same environment, method, version and
+    seed, from any commit; jobs without such a result are missing."""
     first: dict[tuple[str, ...], dict[str, Any]] = {}
     for result in results:
         if result["status"] == "ok":
@@ -211,7 +211,7 @@ def _run_job(job: Job, store: EpisodeStore, run: dict[str, Any], home: str,
         result, fields = run_episode(job)
         if any(result[name] != beginning[name] for name in _INVARIANT_FIELDS):
             raise ValueError(f"{job.method}: metadata changed between episodes")
-        # a world of a script is identified by the script's file, which this process lacks
+        # the identity of a world defined in a script depends on the script, unknown in this process
         result["identity"] = beginning["identity"]
     except Exception as error:
         result, fields = beginning | _failure_result(error, Path(job.method)), {}
@@ -222,5 +222,5 @@ def _run_job(job: Job, store: EpisodeStore, run: dict[str, Any], home: str,
     try:
         store.put(job.environment.name, result["method"], job.seed, result, fields)
     except OSError:
-        isolation.close()  # its folder may be what fills the disk
+        isolation.close()  # the worker's folder may fill the disk
         store.put(job.environment.name, result["method"], job.seed, result, fields)

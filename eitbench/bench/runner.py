@@ -1,4 +1,4 @@
-"""Run methods on episodes, step by step or whole."""
+"""Run methods on episodes, step by step or as a whole."""
 
 from __future__ import annotations
 
@@ -42,17 +42,17 @@ class EpisodeRun(NamedTuple):
 
     outcome: Outcome
     currents: np.ndarray
-    """(steps, L) A (A/m in 2D), injected in each step"""
+    """(steps, L) A (A/m in 2D), injected currents of each step"""
     fields: dict[str, np.ndarray]
-    """Means and standard deviations of an estimator's estimates as float32, for pictures; empty for
+    """Means and standard deviations of an estimator's estimates as float32, for figures; empty for
     policies and on measurements."""
     actions: list[Any] | None = None
-    """of a policy, JSON-ready"""
+    """actions of a policy, JSON-ready"""
 
 
 def cached_environment(asked: Environment) -> Any:
-    """Make an environment once a process, so that all its episodes share its models, and what
-    methods derive from them; errors as `Environment.make`."""
+    """Make an environment once per process, so that all its episodes share its models and data that
+    methods derive from them; errors as in `Environment.make`."""
     if is_measured(asked.id):
         return _cached_environment(asked, None, "")
     registered = entry(asked.id)
@@ -61,19 +61,19 @@ def cached_environment(asked: Environment) -> Any:
 
 @lru_cache(maxsize=4)
 def _cached_environment(asked: Environment, world: World | None, settings: str) -> Any:
-    """Make it; ``world`` and ``settings`` of the id may be registered again."""
+    """Make the environment; ``world`` and ``settings`` are keys, as an id may be re-registered."""
     return asked.make()
 
 
 def is_compatible(method: Method, env: Any) -> bool:
-    """Return whether an environment belongs to one of a method's boards and suits it."""
+    """Return whether an environment is of one of a method's subtracks and compatible with it."""
     known = env.rules if isinstance(env, InjectionEnv) else env.task
     return subtrack_of(env) in method.subtracks and method.suits(known)
 
 
 def run_method(asked: Environment, method: Method, seed: int) -> EpisodeRun:
-    """Run one whole episode. ``ValueError`` if there is no such environment, it is of another track
-    than the method, or the method does not suit it or returns an invalid answer."""
+    """Run one episode. ``ValueError`` if the environment is unknown or of another track than the
+    method, or the method is incompatible with it or returns an invalid value."""
     check_track(asked.id, method.track)
     env = cached_environment(asked)
     if isinstance(env, InjectionEnv):
@@ -87,35 +87,35 @@ def run_method(asked: Environment, method: Method, seed: int) -> EpisodeRun:
 
 def run_on_measurements(env: MeasuredEnv, method: str | Method, seed: int = 0, *,
                         kept: Collection[int] | None = None) -> MeasuredRun:
-    """Run a built-in estimator, or the one of a path, on measurements.
+    """Run an estimator, built-in or given by a path, on measurements.
 
-    ``seed`` draws the withheld readings; estimates are kept at the steps ``kept``, by default all.
-    ``ValueError`` if the method does not suit the task or returns an invalid estimate.
+    ``seed`` determines the withheld measurements; estimates are stored for the steps ``kept``, by
+    default all. ``ValueError`` if the method is incompatible or returns an invalid estimate.
     """
     if isinstance(method, str):
         method = load_method(method, "estimation")
     if "filter" not in method.subtracks:
         raise ValueError("method must estimate the present state, as in filtering, got "
                          f"{method.name} for {', '.join(method.subtracks)}")
-    env.reset(seed=seed)                            # chooses the task before the clock starts
+    env.reset(seed=seed)                            # sets the task before the time measurement
     if not method.suits(env.task):
         raise ValueError(f"method must suit a target that {_motion(env.task)}, got {method.name}")
     with threadpool_limits(1):
         steps = tqdm(_iter_steps(env, method, seed), total=env.episode_steps, desc=method.name,
-                     unit="reading", disable=None, leave=False)
+                     unit="measurement", disable=None, leave=False)
         return MeasuredRun.collect(env, method.name, steps, kept)
 
 
 def _motion(task: Task) -> str:
     if isinstance(task.transport, StationaryTransport):
-        return "stands still"
+        return "is stationary"
     if isinstance(task.transport, RandomWalk):
-        return "walks at random"
-    return f"is carried by a flow that is {'known' if task.velocity is None else 'estimated'}"
+        return "follows a random walk"
+    return f"is advected by a flow that is {'known' if task.velocity is None else 'estimated'}"
 
 
 def run_estimator(env: EstimationEnv, estimator: Method, seed: int) -> EpisodeRun:
-    """Run an estimator on one whole episode."""
+    """Run an estimator on one episode."""
     said = EstimatorOutput.collect(env.task, _iter_steps(env, estimator, seed))
     return EpisodeRun(estimation_outcome(env, said), said.currents, said.fields())
 
@@ -125,7 +125,7 @@ def _run_policy(env: InjectionEnv, policy: Method, seed: int) -> EpisodeRun:
     currents = list[np.ndarray]()
     claims = list[ScoredEstimate]()
     actions = list[Any]()
-    # the clock of `iter_injections` stands still while the filter is asked
+    # `iter_injections` does not measure the time of this loop's body
     for t, observation, elapsed in iter_injections(env, policy, seed, actions):
         seconds += elapsed
         currents.append(observation["currents"])
@@ -139,9 +139,9 @@ def _run_policy(env: InjectionEnv, policy: Method, seed: int) -> EpisodeRun:
 
 def iter_injections(env: InjectionEnv, policy: Method, seed: int, actions: list[Any] | None = None,
                ) -> Iterator[tuple[int, dict[str, np.ndarray], float]]:
-    """Yield (t of the observed state, observation, seconds the policy took) after each injection of
-    one episode. The first time includes the policy's constructor. ``actions`` receives the actions.
-    Errors as `run_method`."""
+    """Yield (t of the observed state, observation, seconds of the policy) after each injection of
+    one episode. The first time includes the policy's constructor. Actions are appended to
+    ``actions``. Errors as in `run_method`."""
     if not policy.suits(env.rules):
         raise ValueError(f"policy {policy.name} does not suit {env.spec.id if env.spec else env}")
     with allow_test_seeds():
@@ -163,16 +163,16 @@ def iter_injections(env: InjectionEnv, policy: Method, seed: int, actions: list[
 
 
 def policy_generator(seed: int) -> np.random.Generator:
-    """Return the generator that a policy draws from in the episode of this seed."""
-    # A generator reveals its seed, so the policy's gets a state only.
+    """Return the random generator of a policy in the episode of this seed."""
+    # a generator reveals its seed: the policy gets one that is made from a state only
     drawn = np.random.default_rng(int(episode_streams(seed).policy.integers(2**63)))
     return generator_from_state(drawn.bit_generator.state)
 
 
 def iter_estimates(env: EstimationEnv, estimator: Method,
               seed: int) -> Iterator[tuple[int, Estimate]]:
-    """Yield (t, estimate of the state t ≥ 1) in one episode. The estimator gets the task and the
-    measurements, neither rewards nor the environment."""
+    """Yield (t, estimate of the state t ≥ 1) in one episode. The estimator receives the task and
+    the measurements, but neither rewards nor the environment."""
     for t, estimate, _, _ in _iter_steps(env, estimator, seed):
         if estimate is not None and t >= 1:
             yield t, estimate
@@ -180,7 +180,7 @@ def iter_estimates(env: EstimationEnv, estimator: Method,
 
 def _iter_steps(env: EstimationEnv | MeasuredEnv, estimator: Method, seed: int,
                ) -> Iterator[tuple[int, Estimate | None, dict[str, np.ndarray], float]]:
-    """Yield (t = i − lag, estimate, measurement i, seconds the estimator took) at each step i."""
+    """Yield (t = i − lag, estimate, measurement i, seconds of the estimator) at each step i."""
     with allow_test_seeds():
         observation, _ = env.reset(seed=seed)
     if estimator.privileged and not isinstance(env, EstimationEnv):
@@ -201,7 +201,7 @@ def _iter_steps(env: EstimationEnv | MeasuredEnv, estimator: Method, seed: int,
         seconds = time.perf_counter() - begin + setup
         setup = 0.0
         if estimate is None and t >= 1:
-            raise ValueError("Estimator.update must return an Estimate once a state is asked for; "
+            raise ValueError("Estimator.update must return an Estimate for each state t ≥ 1; "
                              f"at t = {t} it returned None")
         if estimate is not None:
             _check_estimate(estimate, env.task, np.isfinite(seen["voltages"]))
@@ -212,7 +212,7 @@ def _iter_steps(env: EstimationEnv | MeasuredEnv, estimator: Method, seed: int,
 
 
 def _action(task: Task, estimate: Estimate | None, silence: np.ndarray) -> np.ndarray:
-    """Return the environment's action, with the nominal flow where an estimator gives none."""
+    """Return the environment's action; the flow is nominal if the estimator returns none."""
     mean = silence if estimate is None else estimate.mean
     if task.velocity is None:
         return mean
@@ -221,7 +221,7 @@ def _action(task: Task, estimate: Estimate | None, silence: np.ndarray) -> np.nd
 
 
 def _check_estimate(estimate: Any, task: Task, measured: np.ndarray) -> None:
-    """Check an estimate; the innovation may be NaN where nothing was ``measured`` (m,)."""
+    """Check an estimate; the innovation may be NaN where ``measured`` (m,) is false."""
     n = task.mesh.n_nodes
     if not isinstance(estimate, Estimate):
         raise ValueError("Estimator.update must return an Estimate or None, got "
@@ -231,7 +231,7 @@ def _check_estimate(estimate: Any, task: Task, measured: np.ndarray) -> None:
     for name, value in (("velocity", velocity), ("velocity_variance", velocity_variance)):
         if value is not None:
             if task.velocity is None:
-                raise ValueError(f"Estimate.{name} must be None where the flow is not asked for, "
+                raise ValueError(f"Estimate.{name} must be None where the flow is not estimated, "
                                  f"got {value!r}")
             _check.array(f"Estimate.{name}", value, (task.velocity.n_parameters,))
     if innovation is not None:
@@ -252,7 +252,7 @@ def _check_covariance(covariance: Any, size: int) -> None:
     _check.array("Estimate.innovation_covariance", covariance, (size, size), units="V²")
     given = np.asarray(covariance, float)
     spectrum = np.linalg.eigvalsh(0.5 * given + 0.5 * given.T)
-    # νᵀS⁻¹ν could be less than none
+    # else νᵀS⁻¹ν could be negative
     if spectrum[0] <= size * np.finfo(float).eps * spectrum[-1]:
         raise ValueError("Estimate.innovation_covariance must be positive definite, got "
                          f"eigenvalues from {spectrum[0]:g} to {spectrum[-1]:g} V²")

@@ -110,7 +110,7 @@ class Score:
     factor: float = 1.0
     """Factor of displayed values: 1e3 for seconds in ms."""
     deterministic: bool = True
-    """Whether a rerun of the episode gives the same number; false for times."""
+    """True if a rerun of the episode gives the same number; false for times."""
 
     def __post_init__(self) -> None:
         if not self.name.isidentifier() or self.name != self.name.lower() or self.name[0] == "_":
@@ -154,7 +154,7 @@ def register_score(score: Score) -> Score:
 
 def scores(track: str | None = None) -> dict[str, Score]:
     """Map names to the scores of one of `KINDS`, or of all tracks, in the order of tables: built-in
-    scores, those of installed packages, then other registered ones."""
+    scores, scores of installed packages, then other registered ones."""
     _load_installed()
     kinds = set(TRACKS) if track is None else {track}
     return {name: each for name, each in _scores.items() if kinds & set(each.tracks)}

@@ -1,17 +1,17 @@
-"""Statistics of a board: interquartile mean, bootstrap intervals, paired comparisons.
+"""Statistics of a leaderboard: interquartile mean, bootstrap intervals, paired comparisons.
 
-Methods run on the same episodes, named by their seeds, in several environments. An environment is a
-stratum: episodes are resampled within it, the environments stay as they are. Intervals are
-percentile bootstrap intervals of 95 % (Efron & Tibshirani, *An introduction to the bootstrap*,
-1993, ch. 13), stratified as in Agarwal et al., "Deep reinforcement learning at the edge of the
-statistical precipice" (NeurIPS 2021), and expanded, since with few episodes the plain ones are too
-narrow: cut off where Student's t would (Hesterberg, "What teachers should know about the
-bootstrap", The American Statistician 69, 2015, section 5.3). Scores are sorted, by value or by
-seed, before they are resampled, and ``seed`` fixes the random stream: the same scores give the same
-interval in any process, however they are listed. `docs/statistics.md` defines the numbers.
+Methods run on the same episodes, identified by their seeds, in several environments. Environments
+are strata: episodes are resampled within each environment. Intervals are 95 % percentile bootstrap
+intervals (Efron & Tibshirani, *An introduction to the bootstrap*, 1993, ch. 13), stratified as in
+Agarwal et al., "Deep reinforcement learning at the edge of the statistical precipice" (NeurIPS
+2021), and expanded with Student's t, as plain ones are too narrow for few episodes (Hesterberg,
+"What teachers should know about the bootstrap", The American Statistician 69, 2015, section 5.3).
+Scores are sorted, by value or by seed, before they are resampled, and ``seed`` fixes the random
+stream: intervals do not depend on the process or on the order of the scores. `docs/statistics.md`
+defines the numbers.
 
-`scipy.stats.bootstrap` has no strata and draws anew for each statistic, which takes minutes for a
-leaderboard; here all methods of a board share one set of resamples.
+`scipy.stats.bootstrap` has no strata and resamples for each statistic, which takes minutes for a
+leaderboard; here all methods of a leaderboard share one set of resamples.
 """
 
 from __future__ import annotations
@@ -31,24 +31,23 @@ Scores = Mapping[str, Mapping[str, float]]
 Statistic = Callable[..., Any]
 """Maps one array (..., n_e) for each environment to (...), where ... are resamples."""
 N_RESAMPLES = 10_000
-"""resamples"""
 MIN_EPISODES = 6
-"""Episodes below which there is no interval: where all n differences have one sign each resample
-has it, and zero lies outside; for two equal methods that happens with probability 2^(1 − n), above
+"""Number of episodes required for an interval. If all n differences have the same sign, so has each
+resample, and the interval excludes zero; for two equal methods the probability is 2^(1 − n), above
 5 % for n < 6."""
 
 
 def interquartile_mean(*scores: ArrayLike) -> Any:
     """Average the middle half of all scores pooled: the 25 % trimmed mean (Agarwal et al. 2021).
 
-    Of N scores the ⌊N/4⌋ lowest and the ⌊N/4⌋ highest are left out. Where 4 does not divide N, a
-    little more than half therefore stays, with equal weights.
+    The ⌊N/4⌋ lowest and the ⌊N/4⌋ highest of N scores are discarded. If 4 does not divide N,
+    slightly more than half remain, with equal weights.
 
     Parameters
     ----------
     *scores : (..., n_e) each
-        One array an environment. Pooled along the last axis, so that an environment weighs as much
-        as it has episodes; all must be on one scale.
+        One array for each environment. They are pooled along the last axis, so that the weight of
+        an environment is its number of episodes; all must have the same scale.
 
     Returns
     -------
@@ -57,13 +56,13 @@ def interquartile_mean(*scores: ArrayLike) -> Any:
     strata = [np.asarray(stratum, dtype=float) for stratum in scores]
     if not (total := sum(stratum.shape[-1] for stratum in strata)):
         raise ValueError("scores must hold at least one score")
-    # as scipy.stats.trim_mean(…, 0.25), but independent of the order to the last bit
+    # equals scipy.stats.trim_mean(…, 0.25), but does not depend on the order to the last bit
     ordered = np.sort(np.concatenate(strata, axis=-1), axis=-1)
     return ordered[..., total // 4:total - total // 4].mean(axis=-1)
 
 
 def mean_over_environments(*scores: ArrayLike) -> Any:
-    """Average the means of the environments, (...) from (..., n_e) each; all weigh the same."""
+    """Average the means of the environments, (...) from (..., n_e) each, with equal weights."""
     if not scores or not all(np.shape(stratum)[-1] for stratum in scores):
         raise ValueError("scores must hold at least one score of each environment")
     means = [np.mean(np.asarray(stratum, dtype=float), axis=-1) for stratum in scores]
@@ -83,7 +82,7 @@ def stratified_bootstrap(scores_by_stratum: Mapping[str, ArrayLike], statistic: 
     statistic : callable
         Called with one array for each environment, in the order of their names: (n_e,) for the
         value, and once for all resamples with (n_resamples, n_e). It must not depend on the order
-        of episodes; as `interquartile_mean` and `mean_over_environments`.
+        of episodes; e.g. `interquartile_mean` and `mean_over_environments`.
     n_resamples, seed : int
         Number of resamples, and the seed of their random stream.
 
@@ -105,25 +104,25 @@ def stratified_bootstrap(scores_by_stratum: Mapping[str, ArrayLike], statistic: 
 
 def paired_difference(a: Scores, b: Scores, *, statistic: Statistic = mean_over_environments,
                       n_resamples: int = N_RESAMPLES, seed: int = 0) -> tuple[float, float, float]:
-    """Subtract a statistic of b from that of a, on the episodes that both have, with the 95 %
-    interval; below zero a is lower.
+    """Compute statistic(a) − statistic(b) on the episodes that both have, with its 95 % interval;
+    negative if a is lower.
 
-    What makes an episode hard for both cancels, so far smaller differences are seen than by
-    comparing two intervals. In every resample both have the same episodes. By default it is the
-    mean difference, of several environments the mean of their means. Of b and a it is the exact
-    negative.
+    Every resample has the same episodes for both, so the difficulty of an episode cancels, and far
+    smaller differences are significant than in a comparison of two intervals. The default is the
+    mean difference; for several environments the mean of their means. Exchanging a and b changes
+    the sign exactly.
 
     Parameters
     ----------
     a, b : environment -> seed -> score
-        Seeds that only one of them has do not count.
+        Seeds that only one of them has are ignored.
     statistic, n_resamples, seed
-        As in `stratified_bootstrap`; so are the three numbers returned.
+        As in `stratified_bootstrap`, like the three returned numbers.
 
     Raises
     ------
     ValueError
-        If the environments differ, or there is one without any shared seed.
+        If the environments differ, or a and b share no seed in one of them.
     """
     ours, theirs = _shared(a, b)
     value = float(statistic(*ours) - statistic(*theirs))
@@ -141,8 +140,8 @@ def paired_probability_of_improvement(a: Scores, b: Scores, *, higher_is_better:
     """Compute the fraction of the shared episodes in which a is better than b, with its 95 %
     interval; an equal score counts ½.
 
-    The mean over environments of each one's fraction. Arguments, pairing and errors as in
-    `paired_difference`; where there is no interval, 0 and 1 are its ends.
+    The value is the mean of the environments' fractions. Arguments, pairing and errors as in
+    `paired_difference`; with too few episodes the interval is [0, 1].
     """
     sign = 1.0 if higher_is_better else -1.0
     wins = {str(i): 0.5 * (1.0 + sign * np.sign(ours - theirs))
@@ -154,13 +153,13 @@ def paired_probability_of_improvement(a: Scores, b: Scores, *, higher_is_better:
 
 def resample(strata: Sequence[np.ndarray], statistic: Statistic, n_resamples: int,
               seed: int) -> np.ndarray:
-    """Compute a statistic of resamples of each stratum (n_e,): (n_resamples,)."""
+    """Compute a statistic (n_resamples,) of resamples of the strata (n_e,)."""
     if n_resamples < 1:
         raise ValueError(f"n_resamples must be at least 1, got {n_resamples}")
     positions = _positions(tuple(map(len, strata)), n_resamples, seed)
     values = np.asarray(statistic(*(stratum[drawn] for stratum, drawn
                                     in zip(strata, positions, strict=True))))
-    if values.shape != (n_resamples,):  # np.mean, say, would make one number of all resamples
+    if values.shape != (n_resamples,):  # e.g. np.mean would also average over the resamples
         raise ValueError("statistic must reduce the last axis only: expected shape "
                          f"{(n_resamples,)}, got {values.shape}")
     return values
@@ -178,12 +177,12 @@ def _positions(sizes: tuple[int, ...], n_resamples: int, seed: int) -> tuple[np.
 
 @lru_cache(maxsize=256)
 def tail_percent(sizes: tuple[int, ...]) -> float:
-    """Compute the percentage of the resamples to leave out at each end for an interval of 95 %,
-    from the number of episodes in each stratum.
+    """Compute the percentage of resamples outside each end of a 95 % interval, from the number of
+    episodes in each stratum.
 
-    2.5 in the limit. The spread of resamples is that of the n numbers divided by n, not by the n −
-    E degrees of freedom that E strata leave, and a normal quantile is less than Student's; this
-    makes up for both.
+    The limit is 2.5. The correction is for the variance of resamples, which has the denominator n
+    instead of the n − E degrees of freedom with E strata, and for the normal quantile, which is
+    smaller than Student's.
     """
     n = sum(sizes)
     freedom = n - len(sizes)
@@ -191,7 +190,7 @@ def tail_percent(sizes: tuple[int, ...]) -> float:
 
 
 def _interval(values: np.ndarray, strata: Sequence[np.ndarray]) -> tuple[float, float]:
-    """Compute the ends of the interval of resampled values (n_resamples,) of these strata."""
+    """Compute the ends of the interval from resampled values (n_resamples,) of the strata."""
     cut = tail_percent(tuple(map(len, strata)))
     # one interpolation for both ends, so that the ends for −values are the exact negatives
     below, above = (np.percentile(side, cut) for side in (values, -values))
@@ -199,7 +198,7 @@ def _interval(values: np.ndarray, strata: Sequence[np.ndarray]) -> tuple[float, 
 
 
 def has_enough_episodes(strata: Sequence[np.ndarray]) -> bool:
-    """Return whether strata (n_e,) have an interval: `MIN_EPISODES` episodes, and two in each."""
+    """Return whether strata (n_e,) have `MIN_EPISODES` episodes in total, and two in each."""
     sizes = list(map(len, strata))
     return min(sizes) >= 2 and sum(sizes) >= MIN_EPISODES
 
@@ -220,7 +219,7 @@ def _shared(a: Scores, b: Scores) -> tuple[list[np.ndarray], list[np.ndarray]]:
              for environment in sorted(a)}
     for environment, shared in seeds.items():
         if not shared:
-            raise ValueError("a and b must share a seed in every environment; there is none in "
+            raise ValueError("a and b must share a seed in every environment, got none in "
                              f"{environment}")
     ours, theirs = ([np.array([side[environment][seed] for seed in shared], dtype=float)
                      for environment, shared in seeds.items()] for side in (a, b))

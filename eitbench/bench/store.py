@@ -1,4 +1,4 @@
-"""Results on disk: one file an episode, replaced atomically; records are gathered from them."""
+"""Results on disk: one file per episode, replaced atomically, from which records are built."""
 
 from __future__ import annotations
 
@@ -39,29 +39,27 @@ from eitbench.data.seeds import format_seed
 
 PACKAGES = ("eitbench", "numpy", "scipy", "gymnasium", "scikit-fem", "numba", "stable-baselines3",
             "sb3-contrib", "torch")
-"""Packages whose versions a record names."""
+"""Packages whose versions are part of a record."""
 _OF_ALL = ("environment", "method", *COMMON_FIELDS)
-"""Fields that the results of one record have in common."""
+"""Fields that all results of one record share."""
 _LOCAL = ("traceback",)
-"""Fields of a result that its user sees and a record does not have."""
+"""Fields of a result that are not part of a record."""
 _OUTPUTS = ("--out", "-o", "--to")
-"""Options of commands that name where results go, on which no score depends."""
+"""Command-line options for output folders, on which no score depends."""
 
 
 class EpisodeStore:
-    """The folder of a run: ``episodes/ENV/METHOD/SEED.json`` with its estimates in ``SEED.npz``
-    beside it.
+    """Folder of a run: ``episodes/ENV/METHOD/SEED.json``, with the estimates in ``SEED.npz``.
 
-    Every file is written whole or not at all, so runs may share a folder and may be interrupted
-    anywhere.
+    Files are written atomically, so runs may share a folder and may be interrupted at any time.
     """
 
     def __init__(self, folder: Path) -> None:
-        self.folder = Path(folder).absolute()           # worker processes may stand elsewhere
+        self.folder = Path(folder).absolute()           # workers may have other working folders
 
     def put(self, environment: str, method: str, seed: int, result: dict[str, Any],
             fields: dict[str, np.ndarray]) -> None:
-        """Store one episode; the estimates first, so that a result is never without them."""
+        """Store one episode; the estimates first, so that a stored result always has them."""
         path = self._path(environment, method, format_seed(seed))
         if fields:
             content = io.BytesIO()
@@ -70,7 +68,7 @@ class EpisodeStore:
         write_atomically(path, json.dumps(result, indent=1, allow_nan=False).encode())
 
     def has_result(self, environment: str, method: str, seed: int, identity: str) -> bool:
-        """Return whether a successful result of exactly this identity is there."""
+        """Return whether a successful result with this identity is stored."""
         try:
             result = self.result(environment, method, seed)
         except ValueError:
@@ -78,11 +76,11 @@ class EpisodeStore:
         return result["identity"] == identity and result["status"] == "ok"
 
     def result(self, environment: str, method: str, seed: int) -> dict[str, Any]:
-        """Return a stored result; ``ValueError`` if there is none, or it is damaged."""
+        """Return a stored result; ``ValueError`` if it is missing or damaged."""
         return _read(self._path(environment, method, format_seed(seed)))
 
     def results(self) -> Iterator[dict[str, Any]]:
-        """Yield all stored results; a damaged file is left out with a warning that names it."""
+        """Yield all stored results; a damaged file is skipped with a warning that names it."""
         for path in sorted(self.folder.glob("episodes/*/*/*.json")):
             try:
                 yield _read(path)
@@ -90,7 +88,7 @@ class EpisodeStore:
                 warnings.warn(f"{sanitize(str(path))} is left out: it {error}", stacklevel=2)
 
     def tracebacks(self, record: dict[str, Any]) -> dict[str, str]:
-        """Map the seed of each failed episode to the lines of the method's code that led to it."""
+        """Map the seed of each failed episode to the traceback in the method's file."""
         environment, method = record["environment"]["name"], record["method"]
         failed = [episode["seed"] for episode in record["episodes"] if episode["status"] != "ok"]
         texts = dict.fromkeys(failed, "")
@@ -100,10 +98,10 @@ class EpisodeStore:
         return texts
 
     def fields(self, result: dict[str, Any]) -> dict[str, np.ndarray]:
-        """Read the estimates of a result: ``mean`` and perhaps ``std``, (T, n) in mol/m³.
+        """Read the estimates of a result: ``mean`` and optionally ``std``, (T, n) in mol/m³.
 
-        ``std`` is NaN in states for which the method gave none. ``FileNotFoundError`` if there are
-        no estimates; ``ValueError``, naming the file, if it is damaged.
+        ``std`` is NaN in states without a variance. ``FileNotFoundError`` if the estimates are
+        missing; ``ValueError``, naming the file, if it is damaged.
         """
         path = self._path(result["environment"]["name"], result["method"], result["seed"])
         path = path.with_suffix(".npz")
@@ -112,7 +110,7 @@ class EpisodeStore:
                 fields = dict(stored)
         except FileNotFoundError:
             raise
-        # a damaged archive may raise anything: zlib.error, NotImplementedError, RuntimeError, …
+        # a damaged archive may raise zlib.error, NotImplementedError, RuntimeError, …
         except Exception as error:
             raise ValueError(f"estimates {path} cannot be read: {error}") from None
         if "mean" not in fields or not all(
@@ -122,12 +120,11 @@ class EpisodeStore:
         return fields
 
     def records(self, also: Iterable[dict[str, Any]] = ()) -> list[dict[str, Any]]:
-        """Gather the episodes into one record per environment, method and split of the seeds; not
-        checked yet.
+        """Build one unchecked record per environment, method and split of the seeds.
 
-        Of the stored results only those of the latest method's file and scoring count. ``also`` are
-        results of records: where they are of the same version of the method, they fill in what is
-        missing here or failed.
+        Only stored results of the latest method's file and declared versions are used. ``also`` are
+        results of records: with the same version of the method, they replace missing and failed
+        episodes.
         """
         own, others = _by_record(self.results()), _by_record(also)
         records = []
@@ -139,8 +136,8 @@ class EpisodeStore:
         return records
 
     def write_records(self) -> list[dict[str, Any]]:
-        """Write the `records` into ``records/`` and return them; one that is not valid is left out
-        with a warning."""
+        """Write the `records` into ``records/`` and return them; an invalid record is skipped with
+        a warning."""
         written = []
         for record in self.records():
             try:
@@ -173,7 +170,7 @@ def _latest(results: list[dict[str, Any]]) -> dict[str, Any]:
 
 
 def _of_latest_code(results: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Select the results of the method's file and the declared versions that ran last."""
+    """Select the results with the most recently run method's file and declared versions."""
     def code(result: dict[str, Any]) -> tuple[Any, ...]:
         versions = result["run"]["versions"]
         return result["method_sha256"], *map(versions.get, declared_versions())
@@ -183,14 +180,14 @@ def _of_latest_code(results: list[dict[str, Any]]) -> list[dict[str, Any]]:
 
 
 def _gathered(results: list[dict[str, Any]]) -> dict[str, Any]:
-    """Make the self-reported record of one version's episodes; of several results of a seed the
-    first success counts."""
+    """Build the self-reported record from one version's episodes; if a seed has several results,
+    the first successful one is used."""
     latest = _latest(results)
     chosen: dict[str, dict[str, Any]] = {}
     for result in results:
         if chosen.setdefault(result["seed"], result)["status"] != "ok":
             chosen[result["seed"]] = result
-    # 9 before 10
+    # sort 9 before 10
     results = sorted(chosen.values(), key=lambda result: (len(result["seed"]), result["seed"]))
     texts = [json.dumps(result["run"], sort_keys=True) for result in results]
     runs = dict(zip(texts, (result["run"] for result in results), strict=True))
@@ -205,7 +202,7 @@ def _gathered(results: list[dict[str, Any]]) -> dict[str, Any]:
 
 
 def record_results(record: dict[str, Any]) -> list[dict[str, Any]]:
-    """Return the results that were gathered into a record, as a store would hold them."""
+    """Return the results of a record's episodes in the form of a store's results."""
     shared = {key: record[key] for key in _OF_ALL if key in record}
     runs = record.get("runs", [])
     return [episode | shared | ({"run": runs[episode["run"]]} if runs else {})
@@ -213,18 +210,18 @@ def record_results(record: dict[str, Any]) -> list[dict[str, Any]]:
 
 
 def folder_results(folder: Path) -> list[dict[str, Any]]:
-    """Return the results of all records of a folder. Errors as `records.read_records`."""
+    """Return the results of all records of a folder. Errors as in `records.read_records`."""
     return [result for record in read_records(folder) for result in record_results(record)]
 
 
 def _read(path: Path) -> dict[str, Any]:
-    """Read a result. ``ValueError``, without the file's name, if a record of it alone is not
-    valid."""
+    """Read a result. ``ValueError``, without the file's name, if a record of this result is
+    invalid."""
     result = read_json(path)
     try:
         check_record(_gathered([result]))
     except (AttributeError, KeyError, TypeError) as error:
-        raise ValueError(f"is no result of an episode: {type(error).__name__}: {error}") from None
+        raise ValueError(f"is not an episode result: {type(error).__name__}: {error}") from None
     return result  # type: ignore[no-any-return]
 
 
@@ -232,14 +229,14 @@ def _read(path: Path) -> dict[str, Any]:
 
 
 def declared_versions() -> dict[str, str]:
-    """Return the numbers that are raised when the same episode has other scores."""
+    """Return the version numbers that are raised when scores of the same episode change."""
     return {"simulation": str(cache.SIMULATION), "scoring": str(SCORING)}
 
 
 @lru_cache(maxsize=1)
 def provenance() -> dict[str, Any]:
-    """Return versions and commit of the code that this process runs."""
-    # results are not code
+    """Return versions and commit of the code of this process."""
+    # without `leaderboards`, which holds results
     status = _git("--no-optional-locks", "status", "--porcelain", "--", ".", ":!leaderboards")
     config: Any = np.show_config(mode="dicts")  # type: ignore[call-overload]
     blas = config["Build Dependencies"]["blas"]
@@ -252,8 +249,8 @@ def provenance() -> dict[str, Any]:
 
 
 def portable_command(command: str) -> str:
-    """Return a command without the folders of the machine on which it was typed: without output
-    folders, and with the name alone of any other path that is absolute or leads upwards."""
+    """Return a command without machine-specific paths: output folders are removed, and other paths
+    that are absolute or contain ``..`` are reduced to their names."""
     try:
         words = iter(shlex.split(command))
     except ValueError:                                # an unbalanced quote
@@ -275,16 +272,16 @@ def _portable(word: str) -> str:
 
 @lru_cache(maxsize=1)
 def machine() -> dict[str, Any]:
-    """Describe the machine of this process; in a cluster it may be another than that of the process
-    that started the run."""
+    """Describe the machine of this process; in a cluster it may differ from the machine that
+    started the run."""
     return {"processor": _processor(), "cores": os.cpu_count(), "system": platform.system(),
             "blas_threads": 1, "matmul_seconds": matmul_seconds()}
 
 
 @lru_cache(maxsize=1)
 def matmul_seconds() -> float:
-    """Time a 1000 × 1000 × 1000 matrix product in double precision on one thread, in s: the median
-    of three. In units of it, times of different machines can be compared."""
+    """Time a 1000 × 1000 × 1000 matrix product in double precision on one thread, in s (median of
+    three); times relative to it can be compared between machines."""
     a, b = np.random.default_rng(0).normal(size=(2, 1000, 1000))
     with threadpool_limits(1):
         return float(np.median(timeit.repeat(lambda: a @ b, number=1, repeat=3)))
@@ -299,7 +296,7 @@ def _version(package: str) -> str | None:
 
 def _git(*arguments: str) -> str | None:
     checkout = PACKAGE.parent
-    if not (checkout / ".git").exists():  # installed: a repository around it is another one
+    if not (checkout / ".git").exists():  # installed: an enclosing repository is unrelated
         return None
     try:
         return subprocess.run(["git", *arguments], cwd=checkout, capture_output=True, text=True,

@@ -1,4 +1,4 @@
-"""Run the test episodes with one method, or all built-in ones, and write leaderboard records."""
+"""Run the test episodes with one method, or all built-in methods, and write leaderboard records."""
 
 from __future__ import annotations
 
@@ -18,17 +18,17 @@ def submit(method: str | None, environments: list[str], seeds: list[int] | None,
            store: EpisodeStore, to: Path, *, policy: bool = False, official: bool = False,
            isolate: str = "auto", n_jobs: int = 1, backend: str = "loky",
            command: str = "") -> Iterator[Path]:
-    """Check what is asked for, then return an iterator over the paths of records: it runs what
-    neither ``store`` nor an earlier record holds, environment after environment, and writes each
-    record into the folder ``to`` when its environment is finished.
+    """Check the arguments, and return an iterator over the paths of records. It runs the episodes
+    that neither ``store`` nor an earlier record holds, environment after environment, and writes
+    each record into the folder ``to`` when its environment is finished.
 
-    A record holds all test episodes, failed ones too, that the store or an earlier record has of
-    this version of the method. Without a ``method`` all built-in ones are run, by default in all
-    environments. ``official`` records are a maintainer's, from a commit without changes.
+    A record holds all test episodes of this version of the method from the store and from an
+    earlier record, including failed ones. Without ``method`` all built-in methods run, by default
+    in all environments. ``official`` records are made by maintainers from a commit without changes.
 
-    ``ValueError`` by the call, if a seed is not of the test split, the method does not run in one
-    of the environments, an official record is asked for from a checkout with changes, or would be
-    replaced by another; by the iterator, if a record is not valid or would lose episodes.
+    The call raises ``ValueError`` if a seed is not of the test split, the method is incompatible
+    with an environment, an official record is requested from a checkout with changes, or would be
+    replaced by an unofficial one; the iterator does if a record is invalid or would lose episodes.
     """
     code = provenance()
     if official and (code["commit"] is None or code["dirty"]):
@@ -75,7 +75,7 @@ def _submitted(jobs: list[Job], store: EpisodeStore, to: Path, split: str, offic
         for path, old in earlier.items():
             missing = [seed for seed in old["seeds"] if seed not in record["seeds"]]
             if missing and all(old[key] == record[key] for key in ("method", "version")):
-                raise ValueError("to must not hold a record that says more; "
+                raise ValueError("to must not hold a record with other episodes; "
                                  f"{path} would lose its episodes {seed_ranges(missing)}")
     for record in made:
         yield write_record(to, record)
@@ -83,7 +83,7 @@ def _submitted(jobs: list[Job], store: EpisodeStore, to: Path, split: str, offic
 
 def _jobs(method: str | None, id: str, policy: bool, seeds: list[int] | None,
           isolate: str, official: bool) -> list[Job]:
-    """Return what is to be run in one environment."""
+    """Return the jobs of one environment."""
     methods = [] if method is None else [method]
     asked = "injection" if policy else "estimation"
     track = tracks.track_of(id) if method is None else asked
@@ -91,20 +91,20 @@ def _jobs(method: str | None, id: str, policy: bool, seeds: list[int] | None,
 
 
 def _versions(jobs: list[Job]) -> list[tuple[str, str, str]]:
-    """Return environment, method and version of the jobs, each once."""
+    """Return environment, method and version of the jobs, without duplicates."""
     return list(dict.fromkeys((job.environment.name, job.load().name, job.load().version)
                               for job in jobs))
 
 
 def _earlier(to: Path, jobs: list[Job], split: str, official: bool) -> dict[Path, dict[str, Any]]:
-    """Read the records in ``to`` of these versions of methods. ``ValueError`` if one is official
-    and the new one would not be."""
+    """Read the records in ``to`` of the jobs' versions of methods. ``ValueError`` if one of them is
+    official and the new one is not."""
     found = {}
     for environment, method, version in _versions(jobs):
         name = tracks.record_name(environment, method, version, split)
         if (path := to / name).exists():
             found[path] = read_record(path)
             if found[path]["official"] and not official:
-                raise ValueError("to must not hold a record that says more; "
-                                 f"{path} would lose its being official")
+                raise ValueError("to must not hold an official record; "
+                                 f"{path} would lose its official status")
     return found

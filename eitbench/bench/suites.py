@@ -31,21 +31,21 @@ from eitbench.bench.tracks import (
 )
 
 TOO_SLOW_FOR_QUICK = {("filter", "gauss_newton")}
-"""A reconstruction at every step takes minutes an episode."""
+"""Subtrack and method that the quick suite skips: an episode takes minutes."""
 
 
 def make_jobs(track: str, environments: list[str], methods: list[str],
               seeds: list[int] | None = None, *, suite: str = "full", estimator: str = "full",
               isolate: str = "auto", strict: bool = False,
               worlds: Sequence[dict[str, Any]] = ({},)) -> list[Job]:
-    """Return the jobs of each named method (default: all built-in ones, with trained agents) in
-    each environment that it suits, ordered by environment, method and seed.
+    """Return the jobs of each given method (default: all built-in methods and trained agents) in
+    each compatible environment, ordered by environment, method and seed.
 
-    Environments and seeds are by default those of the ``suite``, quick or full. Each environment
-    has a variant for each of ``worlds`` (the argument ``world`` of `gymnasium.make`), and injection
-    environments the filter ``estimator``. ``isolate`` and ``strict`` are as of
-    `isolation.choose_isolation`. ``ValueError`` if there is no such environment or method, a named
-    method suits none of the environments, or two have one name.
+    The ``suite``, quick or full, determines the default environments and seeds. Each environment
+    has a variant for each of ``worlds`` (the argument ``world`` of `gymnasium.make`); injection
+    environments have the filter ``estimator``. ``isolate`` and ``strict`` are as in
+    `isolation.choose_isolation`. ``ValueError`` if an environment or method is unknown, a given
+    method is compatible with none of the environments, or two methods have the same name.
     """
     if estimator not in ONBOARD_FILTERS:
         raise ValueError(f"estimator must be one of {', '.join(ONBOARD_FILTERS)}, got "
@@ -65,8 +65,8 @@ def make_jobs(track: str, environments: list[str], methods: list[str],
         env = _probe_environment(asked)
         board = subtrack_of(env)
         numbers = default_seeds(id, suite) if seeds is None else seeds
-        # Environment by environment, since models are kept for a few only, and a worker
-        # serves one method.
+        # environment by environment: models are cached for a few only, and a worker serves one
+        # method
         for method in methods or [*builtin_methods(track), *builtin_agents(id)]:
             skipped = suite == "quick" and not methods and (board, method) in TOO_SLOW_FOR_QUICK
             job = isolated_job(asked, method, isolate, strict)
@@ -84,13 +84,13 @@ def make_jobs(track: str, environments: list[str], methods: list[str],
 
 def isolated_job(environment: Environment, method: str, isolate: str,
                  strict: bool = False) -> Job:
-    """Return the job of a method, by name or path, isolated as `isolation.choose_isolation`."""
+    """Return the job of a method, given by name or path; see `isolation.choose_isolation`."""
     kind = choose_isolation(environment, method, isolate, strict=strict)
     return Job(environment, _absolute(method), 0, kind)
 
 
 def _probe_environment(asked: Environment) -> Any:
-    """Make the environment with the filter that is made fastest, for its board and rules only."""
+    """Make the environment with the filter of the shortest setup, to read subtrack and rules."""
     if asked.track == "injection":
         kwargs = json.loads(asked.kwargs) | {"estimator": "reduced"}
         asked = asked._replace(kwargs=json.dumps(kwargs))
@@ -103,10 +103,10 @@ def _check_unique_names(names: dict[str, str]) -> None:
     for file, name in names.items():
         if first.setdefault(name, file) != file:
             raise ValueError(f"{first[name]} and {file} have the same name, under which results "
-                             "are kept; rename one")
+                             "are stored; rename one")
 
 
 def _absolute(method: str) -> str:
-    """Return an absolute path, also of an installed method; a built-in name as it is."""
+    """Return the absolute path of a file or an installed method, or a built-in name unchanged."""
     path = installed_methods().get(method, Path(method))
     return str(path.absolute()) if is_path(str(path)) else method

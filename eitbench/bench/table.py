@@ -1,4 +1,4 @@
-"""Tables: cells of text with the number to sort by, as Markdown, in a terminal, and in pages of
+"""Tables of text cells with sorting keys, for Markdown, terminals and the pages of
 `eitbench.report`."""
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ class Cell(NamedTuple):
 
     text: str
     value: float | str | None = None
-    """Sorting key; None comes last. Words have a text, numbers a number."""
+    """Sorting key: a text for words, a number for numbers; None is sorted last."""
     picture: Markup = Markup()
     link: str = ""
     note: str = ""
@@ -34,13 +34,13 @@ class Cell(NamedTuple):
 
 
 class Row(NamedTuple):
-    """One line of a table."""
+    """One row of a table."""
 
     cells: list[Cell]
     flags: str = ""
-    """Words for the filters of a page, separated by spaces."""
+    """Keywords for the table filters of a page, separated by spaces."""
     children: tuple[Row, ...] = ()
-    """Lines that it summarises, collapsed at first."""
+    """Rows that this one summarises, initially collapsed."""
 
 
 class Table(NamedTuple):
@@ -53,8 +53,8 @@ class Table(NamedTuple):
     @classmethod
     def of(cls, rows: Iterable[Mapping[str, Cell | str]], *, label: str = "",
            flags: Sequence[str] = (), keep: Sequence[str] = ()) -> Table:
-        """Make a table from mappings heading -> cell, all with the same headings; a text stands for
-        a cell of words. Empty columns are left out unless listed in ``keep``."""
+        """Make a table from mappings heading -> cell, all with the same headings; a string becomes
+        a cell of words. Empty columns are omitted unless listed in ``keep``."""
         made = [{heading: cell if isinstance(cell, Cell) else Cell(cell, cell)
                  for heading, cell in row.items()} for row in rows]
         headings = [heading for heading in (made[0] if made else ())
@@ -64,13 +64,13 @@ class Table(NamedTuple):
 
     @property
     def column_styles(self) -> list[str]:
-        """Style of each column: ``drawn`` intervals, ``words``, or numbers, which is empty."""
+        """Style of each column: ``drawn`` for intervals, ``words``, or empty for numbers."""
         return [_kind([row.cells[i] for row in self.rows]) for i in range(len(self.headings))]
 
     def fit_width(self, width: int, order: Sequence[str] = ()) -> Table:
-        """Return the table with as many columns as lines of ``width`` characters hold.
+        """Return the table without the columns for which ``width`` characters are too few.
 
-        Columns that are not in ``order`` go first, then the last in ``order``; its first stays.
+        Columns that are not in ``order`` are omitted first, then the last in ``order``.
         """
         def place(heading: str) -> tuple[int, int]:
             at = order.index(heading) if heading in order else len(order)
@@ -86,7 +86,7 @@ class Table(NamedTuple):
         return table
 
     def omitted_columns(self, fitted: Table) -> str:
-        """Return a line that names the columns that a `fitted` table lacks, or nothing."""
+        """Return a line with the columns that a `fit_width` table lacks; empty without any."""
         missing = [heading for heading in self.headings if heading not in fitted.headings]
         return f"columns omitted: {', '.join(missing)}" if missing else ""
 

@@ -1,4 +1,4 @@
-"""Numbers and seeds as text, and scores of a record in the units of tables."""
+"""Format numbers and seeds, and convert scores of a record to the units of tables."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ def mean_and_interval(values: list[float]) -> tuple[float, float]:
 
 
 def format_mean(mean: float, half: float) -> str:
-    """``0.0053 ± 0.0004``: one digit of the interval (two if that is a 1), the mean likewise."""
+    """Format as ``0.0053 ± 0.0004``: one digit of the interval (two if the first is 1)."""
     place = _places(half)
     return f"{mean:.3g}" if place is None else f"{mean:z.{place}f} ± {half:.{place}f}"
 
 
 def format_interval(value: float, low: float, high: float) -> str:
-    """``0.0053 (0.0049 to 0.0058)``, rounded by half the interval; without one, the value."""
+    """Format as ``0.0053 (0.0049 to 0.0058)``, without the interval if it is infinite."""
     place = _places(0.5 * (high - low))
     if place is None:
         return f"{value:.3g}"
@@ -47,7 +47,7 @@ def _places(half: float) -> int | None:
 
 
 def scores_by_seed(record: dict[str, Any], name: str) -> dict[str, float]:
-    """Return seed -> score in the units of tables, of the episodes that have it."""
+    """Return seed -> score in the units of tables, for the episodes that have it."""
     # records of older code have fewer scores
     values = {episode["seed"]: episode["scores"].get(name)
               for episode in record["episodes"] if episode["status"] == "ok"}
@@ -57,7 +57,7 @@ def scores_by_seed(record: dict[str, Any], name: str) -> dict[str, float]:
 
 
 def format_number(value: float) -> str:
-    """Return two digits below 1, three above, and all before the point."""
+    """Format with two significant digits below 1, three above, and all before the point."""
     if abs(value) >= 999.5:
         return f"{value:.0f}"
     return f"{value:.2g}" if abs(value) < 1 else f"{value:.3g}"

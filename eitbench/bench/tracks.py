@@ -1,4 +1,4 @@
-"""Registered environments: their tracks, boards and default seeds, all derived from their ids."""
+"""Registered environments: tracks, subtracks and default seeds, all derived from their ids."""
 
 from __future__ import annotations
 
@@ -21,34 +21,34 @@ if TYPE_CHECKING:
 TRACKS = ("estimation", "injection")
 """Tasks: an estimate of every state, or the next injection."""
 SUBTRACKS = {"estimation": ("filter", "fixed-lag", "smoothing"), "injection": ("injection",)}
-"""Boards of each track; in estimation they differ in the lag of an estimate."""
+"""Subtracks of each track; in estimation they differ in the lag of an estimate."""
 ALL_SUBTRACKS = tuple(board for boards in SUBTRACKS.values() for board in boards)
 CATEGORIES = ("filter", "fixed-lag", "smoothing", "stationary", "injection")
-"""Groups of environments that are ranked together: the boards, and stationary targets apart."""
+"""Groups of environments that are ranked together: subtracks, with stationary targets separate."""
 NAIVE_BASELINES = {"estimation": "homogeneous", "injection": "random_pair"}
-"""Naive baselines: their episodes are those of the board, and the gain is relative to them."""
+"""Naive baselines: they define a leaderboard's episodes and the zero of its skill score."""
 ENV_KWARGS = {
     "estimation": ("world", "lag", "assume", "episodes", "render_mode"),
     "injection": ("world", "estimator", "observation", "gate", "inflow", "episodes",
                   "render_mode")}
 """Arguments of the environments of each track."""
 ONBOARD_FILTERS = ("full", "reduced")
-"""Filters inside an injection environment: the exact one, for scores, or that of training."""
+"""Filters inside an injection environment: the exact one for scores, the reduced for training."""
 
 MEASURED = "eitbench.envs.measured:case_env"
 """Entry point of the ids of measured cases."""
 MEASURED_FILES = "eitbench-Measured-"
-"""Beginning of the names of their records."""
+"""Prefix of the file names of their records."""
 MEASURED_SEEDS = "test:0-4"
-"""Each withholds other readings of the same measurements."""
+"""Seeds of runs on measurements, which differ in the withheld measurements."""
 QUICK_IDS = ("eitbench/Pipe2D-v0", "eitbench/Pipe2DFixedLag-v0", "eitbench/Pipe2DSmoothing-v0")
-"""Environments of the quick suite; the full one has all of the track estimation."""
+"""Environments of the quick suite; the full suite has all of the track estimation."""
 QUICK_SEEDS = "test:0-3"
 
 
 RUN_KWARGS = {"estimation": {}, "injection": {"estimator": "full", "observation": "raw"}}
-"""Default arguments of each track's environments in runs: with the exact filter and unscaled
-observations. In training, registered ids have other defaults."""
+"""Default arguments of each track's environments in runs: the exact filter and unscaled
+observations. Registered ids have other defaults, for training."""
 
 
 class Environment(NamedTuple):
@@ -65,17 +65,17 @@ class Environment(NamedTuple):
 
     @property
     def name(self) -> str:
-        """Return a name for folders, which differs where arguments differ."""
+        """Return a name for folders, which depends on the arguments."""
         return environment_name(self.id, self.overrides)
 
     @property
     def track(self) -> str:
-        """As `track_of`."""
+        """Return its track; errors as in `track_of`."""
         return track_of(self.id)
 
     @property
     def arguments(self) -> dict[str, Any]:
-        """Return all arguments with which it is made, defaults included."""
+        """Return all arguments with which it is made, including defaults."""
         creator = load_env_creator(str(gym.spec(self.id).entry_point))
         defaults = {name: each.default for name, each in signature(creator).parameters.items()
                     if each.default is not Parameter.empty and name != "variant"}
@@ -83,8 +83,8 @@ class Environment(NamedTuple):
                 | json.loads(self.kwargs))
 
     def make(self, **extra: Any) -> EstimationEnv | InjectionEnv:
-        """Make the environment without gymnasium's wrappers; ``ValueError`` if there is none of
-        this id, or its arguments are wrong."""
+        """Make the environment without gymnasium's wrappers; ``ValueError`` if the id is unknown or
+        an argument is invalid."""
         arguments = RUN_KWARGS[self.track] | json.loads(self.kwargs) | extra
         if arguments.get("estimator", "full") not in ONBOARD_FILTERS:
             raise ValueError(f"estimator must be one of {', '.join(ONBOARD_FILTERS)}, got "
@@ -94,7 +94,7 @@ class Environment(NamedTuple):
 
 
 def ids(track: str | None = None) -> list[str]:
-    """Return the registered environments of one track, or of all, in their order."""
+    """Return the registered ids of one track, or of all, in the order of registration."""
     return [id for id, each in entries().items() if track in (None, each.track)]
 
 
@@ -114,25 +114,24 @@ def builtin_ids() -> list[str]:
 
 
 def track_of(id: str) -> str:
-    """Return the track of an id; ``ValueError`` if there is no such environment."""
+    """Return the track of an id; ``ValueError`` if the id is unknown."""
     return "estimation" if is_measured(id) else entry(id).track
 
 
 def nominal_id(id: str) -> str:
-    """Return the id of which this one is a shifted variant, with the same task; else empty."""
+    """Return the nominal id of a shifted environment, which has the same task; else empty."""
     return "" if is_measured(id) else entry(id).nominal
 
 
 def check_track(id: str, track: str) -> None:
-    """Raise ``ValueError`` if an environment is of another track, or there is none."""
+    """Raise ``ValueError`` if an environment is unknown or of another track."""
     if track_of(id) != track:
-        asked = {"estimation": "estimates", "injection": "injections"}[track]
-        raise ValueError(f"environment {id} does not ask for {asked}; env must be one of "
+        raise ValueError(f"environment {id} is not of the track {track}; env must be one of "
                          f"{', '.join(ids(track))}")
 
 
 def registered_kwargs(id: str) -> dict[str, Any]:
-    """Return the arguments that an id was registered with; none if it is not registered."""
+    """Return the arguments that an id was registered with; empty for an unknown id."""
     each = entries().get(id)
     if each is None:
         return dict(gym.registry[id].kwargs) if is_measured(id) else {}
@@ -140,14 +139,14 @@ def registered_kwargs(id: str) -> dict[str, Any]:
 
 
 def nondefault_kwargs(id: str, kwargs: dict[str, Any]) -> dict[str, Any]:
-    """Select the arguments that differ from the registered ones."""
+    """Return the arguments that differ from the registered ones."""
     usual = {"world": {}} | registered_kwargs(id)
     return {key: value for key, value in kwargs.items() if value is not None
             and (key not in usual or json.dumps(value) != json.dumps(usual[key]))}
 
 
 def environment_name(id: str, given: dict[str, Any]) -> str:
-    """Return the name of an id with the arguments that differ from the registered ones."""
+    """Return the name of an id with arguments that differ from the registered ones."""
     text = json.dumps(given, sort_keys=True)
     digest = hashlib.sha256(text.encode()).hexdigest()[:8]
     return id.replace("/", "-") + (f"-{digest}" if given else "")
@@ -160,14 +159,14 @@ def qualified_name(environment: Mapping[str, Any]) -> str:
 
 
 def record_name(environment: str, method: str, version: str, split: str) -> str:
-    """Return the name of a record's file: ``ENV--METHOD--VERSION.json``, with the split if that is
-    not test."""
+    """Return the file name of a record: ``ENV--METHOD--VERSION.json``, with the split unless it is
+    test."""
     parts = [environment, method, version, *[split] * (split != "test")]
     return "--".join(parts) + ".json"
 
 
 def subtrack_of(env: EstimationEnv | InjectionEnv) -> str:
-    """Return the board of an environment, one of its track's `SUBTRACKS`."""
+    """Return the subtrack of an environment, one of its track's `SUBTRACKS`."""
     lag = getattr(env, "lag", None)
     if lag is None:
         return "injection"
@@ -177,13 +176,13 @@ def subtrack_of(env: EstimationEnv | InjectionEnv) -> str:
 
 
 def subtracks_of(id: str, kwargs: dict[str, Any]) -> tuple[str, ...]:
-    """Return the boards that a registered id with these arguments may belong to, without making it:
-    one, or two where that depends on a changed world. ``ValueError`` if it has no such arguments.
+    """Return the possible subtracks of a registered id with these arguments, without making it: two
+    if the subtrack depends on a changed world, else one. ``ValueError`` if an argument is invalid.
     """
     track = track_of(id)
     for name, value in kwargs.items():
         if name not in ENV_KWARGS[track]:
-            raise ValueError(f"{name} is no argument of {id}; there are "
+            raise ValueError(f"{name} is not an argument of {id}; it must be one of "
                              f"{', '.join(ENV_KWARGS[track])}")
         if name in ("world", "assume") and not isinstance(value, dict | None):
             raise ValueError(f"{name} must be an object, got {type(value).__name__}")
@@ -199,18 +198,18 @@ def subtracks_of(id: str, kwargs: dict[str, Any]) -> tuple[str, ...]:
         raise ValueError(f"lag must be 'all' or an integer of at least 0, got {lag!r}")
     if lag == 0:
         return ("filter",)
-    if kwargs.get("world"):                                 # whose length is not computed here
+    if kwargs.get("world"):                                 # its length is not computed here
         return ("fixed-lag", "smoothing")
     return ("smoothing",) if lag == each.world.n_steps - 1 else ("fixed-lag",)
 
 
 def track_of_subtrack(board: str) -> str:
-    """Return the track of a board."""
+    """Return the track of a subtrack."""
     return next(track for track, boards in SUBTRACKS.items() if board in boards)
 
 
 def category_of(id: str, board: str) -> str:
-    """Return the one of `CATEGORIES` of an environment's board; ``measured`` for a case."""
+    """Return the category of an environment, one of `CATEGORIES`; ``measured`` for a case."""
     if is_measured(id):
         return "measured"
     each = entries().get(id)
@@ -219,7 +218,7 @@ def category_of(id: str, board: str) -> str:
 
 
 def default_seeds(id: str, suite: str = "full") -> list[int]:
-    """Return the default seeds of an environment: test episodes."""
+    """Return the default seeds of an environment, which are test episodes."""
     if is_measured(id):
         return parse_seeds(MEASURED_SEEDS)
     return parse_seeds(QUICK_SEEDS if suite == "quick" else entry(id).test_seeds)

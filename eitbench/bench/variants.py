@@ -12,7 +12,7 @@ def variants(settings: Iterable[str]) -> list[dict[str, Any]]:
     """Return the argument ``world`` of `gymnasium.make` for each combination of the values.
 
     Settings are ``part.number=value``, or several values separated by commas; values are JSON or
-    words. ``ValueError`` if one has another form, two set the same number, or a value is repeated.
+    words. ``ValueError`` for malformed settings, repeated values, or two settings of one number.
     """
     chosen: dict[str, list[Any]] = {}
     for setting in settings:
@@ -43,12 +43,12 @@ def flatten(changes: dict[str, Any]) -> dict[str, Any]:
 
 
 def format_setting(value: Any) -> str:
-    """Return a value as in a setting: words without quotation marks."""
+    """Format a value as in a setting: words without quotation marks."""
     return value if isinstance(value, str) else json.dumps(value)
 
 
 def _values(text: str) -> list[Any]:
-    """``0.01,0.02`` -> both; ``[1, 2]`` -> one list; ``a,b`` -> two words."""
+    """Parse ``0.01,0.02`` as two numbers, ``[1, 2]`` as one list, ``a,b`` as two words."""
     try:
         return list(json.loads(f"[{text}]"))
     except ValueError:
@@ -63,7 +63,7 @@ def _value(word: str) -> Any:
 
 
 def _nested(settings: Iterable[tuple[str, Any]]) -> dict[str, Any]:
-    """Invert `flat`."""
+    """Invert `flatten`."""
     made: dict[str, Any] = {}
     for path, value in settings:
         *parts, name = path.split(".")

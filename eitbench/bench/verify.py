@@ -1,5 +1,5 @@
-"""Verify records: rerun some of their episodes, or replay a policy's recorded actions, and compare
-the scores."""
+"""Verify records: rerun some of their episodes, or replay the recorded actions of a policy, and
+compare the scores."""
 
 from __future__ import annotations
 
@@ -46,11 +46,11 @@ from eitbench.data.parallel import run_parallel
 from eitbench.data.seeds import parse_seeds
 
 BUILTIN_FIELDS = ("method", "board", "role", "privileged")
-"""Fields that a rerun of a built-in method must repeat; its title may have changed."""
+"""Fields that must be equal in a rerun of a built-in method; its title may have changed."""
 SCORE_TOLERANCE = 1e-6
-"""relative difference of scores within which they agree: processors sum in different orders"""
+"""Accepted relative difference of scores: the order of summation depends on the processor."""
 MANY_ROWS = 30
-"""From here on a table has a row for each environment instead of each episode."""
+"""Above this number of episodes a table has a row for each environment instead."""
 
 
 EMPTY_ROW = {"record": "", "environment": "", "method": "", "episode": "", "isolation": "",
@@ -60,7 +60,7 @@ EMPTY_ROW = {"record": "", "environment": "", "method": "", "episode": "", "isol
 
 
 class EpisodeCheck(NamedTuple):
-    """One episode of one record, to be rerun by a job, or to be replayed."""
+    """One episode of one record, to be rerun by a job or, without a job, replayed."""
 
     record: dict[str, Any]
     episode: dict[str, Any]
@@ -73,16 +73,16 @@ def verify(paths: Sequence[Path], folder: Path, *, file: str | None = None, isol
     """Rerun ``episodes`` of each record, drawn with this ``seed``, and compare the scores.
 
     ``file`` and ``isolate`` as in `job_for_record`; ``replay`` applies recorded actions instead of
-    running the policy. Episodes are simulated again. Reruns are stored in ``folder``, where the
-    same call resumes.
+    running the policy. Episodes are simulated again. Reruns are stored in ``folder``; a repeated
+    call resumes.
 
     Returns
     -------
     DataFrame
         A row for each episode, or for a record that cannot be read or rerun: record, environment,
-        method, episode, isolation (of the rerun, or ``replay``), score (that with the largest
-        relative difference), difference, recorded and rerun (ẽ_c), problem (a sentence where they
-        cannot agree), note.
+        method, episode, isolation (of the rerun, or ``replay``), score (name of the score with the
+        largest relative difference), difference, recorded and rerun (ẽ_c), problem (a sentence if
+        they cannot be compared or other fields differ), note.
     """
     _check.integer("episodes", episodes, low=1)
     rows: list[dict[str, Any]] = []
@@ -114,15 +114,15 @@ def verify(paths: Sequence[Path], folder: Path, *, file: str | None = None, isol
 
 
 def select_records(folder: Path, environments: Sequence[str] = (), *, top: int = 0) -> list[Path]:
-    """Return the paths of the current official records of a folder, of these environments or of
-    all that are simulated.
+    """Return the paths of the current official records of a folder, for the given environments
+    (default: all simulated ones).
 
-    With ``top``, of all current records the ``top`` of each environment with the smallest mean
-    error, without naive baselines, oracles and failures. ``ValueError`` if there are none, or
-    naming all files that are not valid.
+    With ``top``, return instead the ``top`` current records of each environment with the smallest
+    mean error, without naive baselines, oracles and failures. ``ValueError`` without such records,
+    or naming all invalid files.
     """
     read, complaints = read_valid_files(folder)
-    if environments:                        # those of measurements, whose files are rarely there
+    if environments:                        # else without measurements, whose files may be missing
         measured, more = read_valid_files(folder, measured=True)
         read |= measured
         complaints += more
@@ -154,7 +154,7 @@ def _first(records: dict[Path, dict[str, Any]], count: int) -> list[Path]:
 
 
 def submitted_methods_folder(path: Path) -> Path:
-    """Return the folder of methods that belongs to the folder of a record."""
+    """Return the folder of submitted methods that belongs to a record's folder."""
     return path.absolute().parents[1] / "methods"
 
 
@@ -162,29 +162,29 @@ def job_for_record(record: dict[str, Any], file: str | None = None, isolate: str
            submitted: Path | None = None) -> Job:
     """Return the job, with seed 0, that a record describes. The method is in ``file``; by default
     the built-in or installed one of that name, or the file with the record's sha256 in the folder
-    ``submitted``. ``ValueError`` if there is none, or the file is another."""
+    ``submitted``. ``ValueError`` if no file is found, or it does not match the record."""
     environment = Environment(record["environment"]["id"],
                               json.dumps(record["environment"]["kwargs"]))
     method = str(Path(file).absolute()) if file else _known(record) or _submitted(record, submitted)
     if method is None:
         raise ValueError(f"{record['method']} is not a built-in method, and its file is not in the "
-                         "folder methods beside the records: give it with --method, or replay a "
+                         "folder methods next to the records: pass it as --method, or replay a "
                          "policy's recorded actions with --replay")
     path = find_method(method, environment.track)
     built_in = builtin_files(environment.id).get(record["method"])
     if is_builtin(method) and not (built_in and path.samefile(built_in)):
-        raise ValueError(f"{path} is a built-in method, but not {record['method']}, as the record "
-                         "says")
+        raise ValueError(f"{path} must be the method of the record, {record['method']}, got "
+                         "another built-in method")
     sha256 = method_sha256(method_files(path))
     if sha256 != record["method_sha256"] and not is_builtin(method):
-        raise ValueError(f"the sha256 of {path.name} is {sha256}, but that of the record "
-                         f"{record['method_sha256']}")
+        raise ValueError(f"the sha256 of {path.name} is {sha256}, but {record['method_sha256']} in "
+                         "the record")
     isolation = choose_isolation(environment, method, isolate, strict=True)
     return Job(environment, method, 0, isolation)
 
 
 def _known(record: dict[str, Any]) -> str | None:
-    """Return the built-in or installed method of the record's name."""
+    """Return the built-in or installed method with the record's name."""
     name = record["method"]
     path = (builtin_files(record["environment"]["id"]) | installed_methods()).get(name)
     if path is None:
@@ -193,7 +193,7 @@ def _known(record: dict[str, Any]) -> str | None:
 
 
 def _submitted(record: dict[str, Any], folder: Path | None) -> str | None:
-    """Return the file in a folder, or below, that has the record's sha256."""
+    """Return the file in a folder or its subfolders that has the record's sha256."""
     for path in sorted(folder.rglob("*")) if folder else []:
         if not is_path(path.name) or not path.is_file() or path.is_symlink():
             continue
@@ -204,8 +204,8 @@ def _submitted(record: dict[str, Any], folder: Path | None) -> str | None:
 
 
 def is_builtin_record(record: dict[str, Any], method: str) -> bool:
-    """Return whether ``method``, of a record's `job_for_record`, is built in. A copy of a built-in
-    agent's checkpoint counts as built in."""
+    """Return whether ``method``, from a record's `job_for_record`, is built in. A copy of a
+    built-in agent's checkpoint counts as built in."""
     built_in = builtin_files(record["environment"]["id"]).get(record["method"])
     return is_builtin(method) or (built_in is not None and built_in.suffix == ".zip"
                                and builtin_sha256(built_in) == record["method_sha256"])
@@ -216,8 +216,8 @@ def is_builtin_record(record: dict[str, Any], method: str) -> bool:
 
 def _rerun_rows(cases: list[EpisodeCheck], folder: Path, n_jobs: int, backend: str,
                 ) -> list[dict[str, Any]]:
-    """Run what the folder does not hold yet, and compare. Each version of a method has its store,
-    as third-party methods may share a name; so has each kind of isolation."""
+    """Run the episodes that are not stored in the folder, and compare. Versions of a method have
+    separate stores, as third-party methods may share a name; so have kinds of isolation."""
     found: dict[Path, list[tuple[EpisodeCheck, Job]]] = {}
     for case in cases:
         if case.job is not None:
@@ -273,7 +273,7 @@ def _compared(case: EpisodeCheck, result: dict[str, Any], isolation: str,
 
 
 def replay_actions(record: dict[str, Any], recorded: dict[str, Any]) -> dict[str, Any]:
-    """Return the result of an episode in which a record's actions are applied without its policy.
+    """Return the result of an episode to which a record's actions are applied without its policy.
     ``ValueError`` if the record has no actions, or the environment rejects them."""
     actions = recorded.get("actions")
     if actions is None:
@@ -288,21 +288,21 @@ def replay_actions(record: dict[str, Any], recorded: dict[str, Any]) -> dict[str
 
 
 class _Replay:
-    """A policy that returns recorded actions."""
+    """Policy that returns recorded actions."""
 
     def __init__(self, actions: list[Any]) -> None:
         self._left = iter(actions)
 
     def act(self, observation: dict[str, np.ndarray]) -> Any:
-        """Return the next action; ``ValueError`` if there is none."""
+        """Return the next action; ``ValueError`` after the last."""
         for action in self._left:
             return action if isinstance(action, int) else np.asarray(action)
-        raise ValueError("actions must be as many as the episode has steps")
+        raise ValueError("actions must have one entry for each step of the episode")
 
 
 def score_differences(recorded: dict[str, Any], result: dict[str, Any]) -> dict[str, float]:
-    """Return score -> relative difference of two results of an episode, of the reproducible scores
-    that the first has, and of the errors of all steps."""
+    """Return score -> relative difference of two results of an episode, for the deterministic
+    scores of the first and for the errors of all steps."""
     known = scores()
     if recorded["status"] != result["status"]:
         return {"status": np.inf}
@@ -315,7 +315,7 @@ def score_differences(recorded: dict[str, Any], result: dict[str, Any]) -> dict[
 
 
 def _relative(a: Sequence[float | None], b: Sequence[float | None]) -> float:
-    """Return the largest |a − b| / max(|a|, |b|); infinite where only one is a number."""
+    """Return the largest |a − b| / max(|a|, |b|); infinite if only one of a pair is a number."""
     first, second = np.array(a, float), np.array(b, float)
     if len(a) != len(b) or (np.isnan(first) != np.isnan(second)).any():
         return float(np.inf)
@@ -328,7 +328,7 @@ def _relative(a: Sequence[float | None], b: Sequence[float | None]) -> float:
 
 
 def describe_problems(rows: pd.DataFrame, tolerance: float = SCORE_TOLERANCE) -> list[str]:
-    """Return a sentence for each episode whose rerun does not agree with its record."""
+    """Return a sentence for each episode whose rerun differs from its record."""
     sentences = []
     for _, row in rows[_differ(rows, tolerance)].iterrows():
         what = row["problem"] or (f"{row['score']} differs by {row['difference']:.2g} (relative); "
@@ -343,7 +343,7 @@ def _differ(rows: pd.DataFrame, tolerance: float) -> pd.Series:
 
 
 def verification_table(rows: pd.DataFrame, tolerance: float = SCORE_TOLERANCE) -> str:
-    """Return Markdown with a row for each episode; for each environment if they are many."""
+    """Return Markdown with a row for each episode, or for each environment (see `MANY_ROWS`)."""
     by = ["environment"] if len(rows) > MANY_ROWS else ["record", "episode"]
     lines: list[dict[str, Cell | str]] = []
     for names, group in rows.groupby(by, sort=False):

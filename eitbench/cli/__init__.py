@@ -1,1 +1,1 @@
-"""Floor 9: the command line."""
+"""Command line (layer 9)."""

@@ -1,4 +1,4 @@
-"""The command `eitbench`, also as `python -m eitbench`."""
+"""Entry point of the command `eitbench` and of `python -m eitbench`."""
 
 import sys
 
@@ -6,7 +6,7 @@ from eitbench._extras import require_extra
 
 
 def main() -> None:
-    """Run the command, or say what it needs to be installed."""
+    """Run the command, or exit with the name of a missing extra."""
     try:
         with require_extra("the command eitbench"):
             from eitbench.cli.app import app

@@ -1,4 +1,4 @@
-"""The command line of eitbench."""
+"""Command line of eitbench."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from eitbench.cli.verify import verify
 
 app = typer.Typer(no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False,
                   context_settings={"help_option_names": ["-h", "--help"]}, help="""
-Benchmark estimators that see a flow only through voltages on the pipe's wall.
+Benchmark of state estimation in electrical impedance tomography.
 
-A first look:  eitbench run  — runs our baselines on four test episodes, prints the table, \
-writes results/index.html.
+Quick start:  eitbench run  — runs the built-in estimators on four test episodes, prints the \
+table, writes results/index.html.
 """)
 
 
-def _say_version(asked: bool) -> None:
+def _print_version(asked: bool) -> None:
     if asked:
         options.echo(f"eitbench {__version__}")
         raise typer.Exit
@@ -32,14 +32,14 @@ def _say_version(asked: bool) -> None:
 @app.callback()
 def _main(
     version: Annotated[bool, typer.Option(
-        "--version", callback=_say_version, is_eager=True, help="Say which this is.")] = False,
+        "--version", callback=_print_version, is_eager=True, help="Print the version.")] = False,
 ) -> None:
     pass
 
 
 @app.command("list")
 def list_() -> None:
-    """Show the environments, the baselines and policies, and which boards they play on."""
+    """List environments, built-in estimators and policies, with their subtracks."""
     from eitbench.bench.methods import builtin_methods, load_method
     from eitbench.bench.tracks import ids, measured_ids, subtracks_of
     from eitbench.worlds.registry import GROUPS, entry
@@ -78,24 +78,24 @@ app.command()(run)
 def submit(
     env: options.Environments = None,
     baseline: Annotated[str | None, typer.Option(
-        help="Name of one of ours, or the path of your own .py file.")] = None,
+        help="Built-in estimator name, or path of a .py file.")] = None,
     policy: Annotated[str | None, typer.Option(
-        help="The same of an injection policy, or the path of a trained agent's model.zip. Without "
-             "any method: all of ours, by default in all environments.")] = None,
+        help="Built-in injection policy name, or path of a .py file or of an agent's model.zip. "
+             "Default: all built-in methods, in all environments.")] = None,
     seeds: Annotated[str | None, typer.Option(
-        help="Test episodes, as in test:0-9. Default: those of the boards.")] = None,
+        help="Episode seeds, e.g. test:0-9. Default: all seeds of the leaderboards.")] = None,
     official: Annotated[bool, typer.Option(
-        "--official", help="For maintainers: a run of theirs.")] = False,
+        "--official", help="Mark the record as official (maintainers only).")] = False,
     isolate: options.Isolate = options.Isolation.auto,
     jobs: options.Jobs = options.CORES,
     backend: options.Backends = options.Backend.loky,
     out: options.Out = Path("results"),
     to: Annotated[Path, typer.Option(help="Folder of the records.")] = options.RECORDS,
 ) -> None:
-    """Play the test episodes with one baseline or policy, or all of ours, and write records for the
-    leaderboards.
+    """Run the test episodes with one estimator or policy, or all built-in ones, and write records
+    for the leaderboards.
 
-    Episodes are stored in OUT the moment they are done; the same command again resumes.
+    Each episode is stored in OUT when it finishes; the same command resumes an interrupted run.
     """
     from eitbench.bench.records import read_record
     from eitbench.bench.store import EpisodeStore
@@ -121,12 +121,12 @@ def golden(
     names: Annotated[list[str] | None, typer.Argument(
         help="Environment ids or built-in methods. Default: all.")] = None,
     new_version: Annotated[bool, typer.Option(
-        "--new-version", help="Write moved numbers as the method's next version.")] = False,
+        "--new-version", help="Write changed numbers as the method's next version.")] = False,
 ) -> None:
     """Compare worlds and built-in methods with their golden files (for maintainers).
 
     Exit status 0 if all numbers agree, 1 otherwise. Missing files are written. A world whose
-    numbers have moved needs a new id, the next -vN. All files take about half an hour.
+    numbers have changed needs a new id, the next -vN. All files take about half an hour.
     """
     from eitbench.bench import golden
     any_moved = False
@@ -137,8 +137,8 @@ def golden(
             for difference in differences:
                 options.echo(f"  {difference}", err=status == "moved")
     if any_moved:
-        options.echo("numbers have moved: find the cause; or give the world the next -vN, or write "
-                    "the method's next version with --new-version and run its records again",
+        options.echo("numbers have changed: find the cause; or give the world the next -vN, or "
+                    "write the method's next version with --new-version and rerun its records",
                     err=True)
         raise typer.Exit(1)
 
@@ -153,13 +153,13 @@ def leaderboard(
     out: options.Out = Path("results"),
     records: Annotated[Path | None, typer.Option(
         help="Folder of the leaderboards' records, such as leaderboards/results: render "
-             "leaderboard.csv, leaderboard.md, episodes.csv.gz and the pages site/ beside it "
+             "leaderboard.csv, leaderboard.md, episodes.csv.gz and the pages site/ next to it "
              "instead.")] = None,
 ) -> None:
-    """Print the table and write the page again from the results stored in a folder.
+    """Print the table and rewrite the page from the results stored in a folder.
 
-    Of --records, those that are not valid are left out and named: exit status 1. Without any that
-    is valid nothing is written.
+    With --records, invalid records are skipped and reported, with exit status 1. Without a valid
+    record, no file is written.
     """
     if records is None:
         with options.cli_errors():
@@ -190,14 +190,14 @@ def leaderboard(
 @app.command()
 def compare(
     a: Annotated[str, typer.Argument(
-        help="A record's file, or METHOD or METHOD@VERSION among the records.")],
-    b: Annotated[str, typer.Argument(help="The same of the other.")],
+        help="File of a record, or METHOD or METHOD@VERSION among the records.")],
+    b: Annotated[str, typer.Argument(help="The method to compare with, as for A.")],
     records: options.Records = options.RECORDS,
     env: options.Environments = None,
-    score: Annotated[str, typer.Option(help="By which score.")] = "error",
+    score: Annotated[str, typer.Option(help="Score to compare.")] = "error",
 ) -> None:
-    """Compare two methods seed by seed: differences with intervals, and how often the first is
-    better; over several environments by gains, as on the boards."""
+    """Compare two methods seed by seed: differences with intervals, and the fraction of episodes in
+    which A is better. Several environments are compared by skill scores, as on the leaderboards."""
     from eitbench.report import compare as comparison
     with options.cli_errors():
         ours, theirs = ([record for record in comparison.find_records(name, records)
@@ -212,24 +212,24 @@ def compare(
 def render(
     env: options.EnvironmentId = "eitbench/Pipe2D-v0",
     baseline: Annotated[list[str] | None, typer.Option(
-        help="Name of one of ours, or a .py file; repeatable. Default: kalman_filter.")] = None,
+        help="Estimator name or path; may be repeated. Default: kalman_filter.")] = None,
     policy: Annotated[str | None, typer.Option(
-        help="The same of an injection policy, or of an agent's model.zip, in place of a baseline "
-             "where injections are asked for.")] = None,
-    seed: Annotated[str, typer.Option(help="The episode, such as dev:0.")] = "dev:0",
+        help="Built-in injection policy name, or path of a .py file or of an agent's model.zip; "
+             "for injection environments.")] = None,
+    seed: Annotated[str, typer.Option(help="Episode seed, e.g. dev:0.")] = "dev:0",
     step: Annotated[int | None, typer.Option(help="Only this state t, as a PNG.")] = None,
-    every: Annotated[int, typer.Option(min=1, help="Draw one state in so many.")] = 1,
+    every: Annotated[int, typer.Option(min=1, help="Draw every Nth state.")] = 1,
     out: Annotated[Path, typer.Option(
         "--out", "-o", help="An animation .gif or .webp, or a .png with --step.",
     )] = Path("results/episode.gif"),
     isolate: options.Isolate = options.Isolation.auto,
 ) -> None:
-    """Draw an episode: truth, estimate, its spread, electrodes; of several baselines estimates."""
+    """Draw an episode: ground truth, estimates, electrodes, standard deviation of one estimate."""
     from eitbench.bench.tracks import track_of
     from eitbench.report.animate import animate
     with options.cli_errors():
         if track_of(env) == "injection" and policy is None:
-            raise ValueError(f"policy must be given for {env}, which asks for injections")
+            raise ValueError(f"policy must be given for {env}, an injection environment")
         animate(env, [policy] if policy else baseline or ["kalman_filter"], seed, step, out,
                 every=every, isolate=isolate)
         options.echo(f"wrote {out}")
@@ -241,11 +241,11 @@ REPLACED = {
     "policies": "eitbench run --env ID --policy NAME", "reproduce": "python studies/thesis NAME",
     "season": "eitbench verify --top 3 --held-out 20 --secret FILE",
     "submit-measured": "eitbench submit --env eitbench/Measured-CASE-v0"}
-"""Removed command -> what replaces it."""
+"""Removed command -> replacement."""
 
 
 def removed(context: typer.Context) -> None:
-    """Print what replaces a removed command."""
+    """Print the replacement of a removed command."""
     name = str(context.info_name)
     options.echo(f"`eitbench {name}` was removed: use `{REPLACED[name]}`", err=True)
     raise typer.Exit(2)

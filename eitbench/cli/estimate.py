@@ -1,4 +1,4 @@
-"""The command `estimate`: estimates from measurements of a real instrument."""
+"""Command `estimate`: estimates from measurements of a real instrument."""
 
 from __future__ import annotations
 
@@ -13,27 +13,27 @@ from eitbench.cli import options
 
 def estimate(
     file: Annotated[Path, typer.Argument(
-        help="Measurements: our HDF5, .mat of KTC2023, KIT4 or EIDORS, a folder of Sciospec's "
-             ".eit, or a table.")],
+        help="Measurements: eitbench HDF5, .mat of KTC2023, KIT4 or EIDORS, a folder of "
+             "Sciospec's .eit, or a table.")],
     vessel: Annotated[Path, typer.Option(help="YAML file that describes the vessel.")],
     baseline: Annotated[list[str], typer.Option(
-        "--baseline", help="Method, by name or path; may be repeated. The first is drawn.")],
+        "--baseline", help="Estimator name or path; may be repeated. The first is drawn.")],
     out: Annotated[Path, typer.Option("--out", "-o", help="Page to write.")] = Path("report.html"),
     arrays: Annotated[Path | None, typer.Option(
-        help="Write all estimates of the first method to this npz file too; they stay in memory "
-             "until then.")] = None,
+        help="Also write all estimates of the first method to this npz file; needs memory for "
+             "all of them.")] = None,
     format: Annotated[str | None, typer.Option(
         help="hdf5, ktc, eidors, sciospec or table. Default: detected.")] = None,
     option: Annotated[list[str] | None, typer.Option(
         "--option", help="Argument NAME=VALUE of the file's reader, such as name=VARIABLE and "
-                         "reference=VARIABLE of an EIDORS file, or frequency=1e4 of Sciospec "
+                         "reference=VARIABLE for an EIDORS file, or frequency=1e4 for Sciospec "
                          "files; may be repeated.")] = None,
     withheld: Annotated[float, typer.Option(
-        min=0.0, max=0.5, help="Fraction of the readings that is withheld from the methods and "
+        min=0.0, max=0.5, help="Fraction of the measurements withheld from the methods, which "
                                "scores them.")] = 0.1,
     span: Annotated[str | None, typer.Option(
-        help="Only readings FIRST:LAST, counted from 0, without the last.")] = None,
-    seed: Annotated[int, typer.Option(min=0, help="Draws the withheld readings.")] = 0,
+        help="Only time steps FIRST:LAST, counted from 0, LAST excluded.")] = None,
+    seed: Annotated[int, typer.Option(min=0, help="Random seed of withheld measurements.")] = 0,
     truth: Annotated[Path | None, typer.Option(
         help="Ground truth in a round tank, in the format of KTC: variable truth of a .mat file, "
              "256 × 256 pixels 0 (water), 1 (resistive), 2 (conductive).")] = None,
@@ -42,10 +42,10 @@ def estimate(
         help="Correction of the misfit on homogeneous fluid: subtract an offset or divide by a "
              "channel gain (offset or gain), or none for absolute images.")] = "offset",
     homogeneous_frames: Annotated[int, typer.Option(
-        min=1, help="Number of first frames of homogeneous fluid, without a reference.")] = 1,
+        min=1, help="Number of initial homogeneous frames, used without a reference.")] = 1,
 ) -> None:
     """Estimate the concentration in a real tank or pipe: calibrate the vessel, run methods, and
-    write a page with estimates, residuals of withheld readings and data-quality warnings."""
+    write a page with estimates, residuals of withheld measurements and data-quality warnings."""
     from eitbench.bench.measured import plotted_steps
     from eitbench.bench.runner import run_on_measurements
     from eitbench.envs.measured import MeasuredEnv
@@ -58,7 +58,7 @@ def estimate(
         measurements = read(file, format, None if span is None else _steps(span),
                             **_reader_options(option or []))
         T, M = measurements.voltages.shape
-        options.echo(f"{file}: {T} times {M} readings of {measurements.currents.shape[1]} "
+        options.echo(f"{file}: {T} × {M} measurements, {measurements.currents.shape[1]} "
                     f"electrodes; a method takes about {10 + 0.03 * T:.0f} s")
         env = MeasuredEnv(measurements, vessel, withheld=withheld, moves=False if still else None,
                           correction=correction, homogeneous_frames=homogeneous_frames)
@@ -89,7 +89,7 @@ def estimate(
 
 
 def _reader_options(texts: list[str]) -> dict[str, float | str]:
-    """Parse ``NAME=VALUE``; a value that is a number becomes one."""
+    """Parse ``NAME=VALUE``; numbers are converted."""
     parsed: dict[str, float | str] = {}
     for text in texts:
         name, equals, value = text.partition("=")
@@ -103,7 +103,7 @@ def _reader_options(texts: list[str]) -> dict[str, float | str]:
 
 
 def _steps(span: str) -> slice:
-    """Parse ``0:800``."""
+    """Parse a span such as ``0:800``."""
     first, colon, last = span.partition(":")
     if not (colon and first.isdigit() and (last.isdigit() or not last)):
         raise ValueError(f"--span must be two numbers such as 0:800, got {span!r}")

@@ -1,5 +1,5 @@
-"""The commands `bank`, `export`, `fit prior`, `fit model` and `train`: episodes to learn from, and
-what is learned from them."""
+"""Commands `bank`, `export`, `fit prior`, `fit model` and `train`: training episodes, and models
+and agents fitted to them."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ fit = typer.Typer(no_args_is_help=True, help="Fit priors and models to training 
 
 def bank(
     env: options.EnvironmentId = "eitbench/Pipe2D-v0",
-    seeds: Annotated[str, typer.Option(help="Episodes, such as train:0-999.")] = "train:0-99",
+    seeds: Annotated[str, typer.Option(help="Episode seeds, e.g. train:0-999.")] = "train:0-99",
     jobs: options.Jobs = options.CORES,
     backend: options.Backends = options.Backend.loky,
 ) -> None:
-    """Simulate many episodes ahead of training and keep what an environment needs of them.
+    """Simulate episodes before training, and store the arrays that an environment needs.
 
-    They lie, memory-mapped, in the cache folder ($EITBENCH_CACHE). The same command again resumes.
+    They are memory-mapped files in the cache folder ($EITBENCH_CACHE). The same command resumes.
     """
     import shutil
 
@@ -42,7 +42,7 @@ def bank(
     try:
         place.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise typer.BadParameter(f"recordings cannot be kept in {place}: {error}") from error
+        raise typer.BadParameter(f"episodes cannot be stored in {place}: {error}") from error
     missing = len(missing_seeds(world, numbers))
     options.echo(f"{len(numbers)} episodes, {len(numbers) * each / 1e6:.0f} MB in {place}; "
                 f"{missing} to simulate")
@@ -52,7 +52,7 @@ def bank(
                                  f"{free / 1e9:.1f} GB are free")
     with options.cli_errors():
         made = presimulate(world, numbers, n_jobs=jobs, backend=backend)
-    options.echo(f"{made} simulated, {len(numbers) - made} were there")
+    options.echo(f"{made} simulated, {len(numbers) - made} were already stored")
 
 
 def export(
@@ -60,21 +60,21 @@ def export(
         "--out", "-o", help="Folder of the files; for minari the name of the data set, such as "
                             "eitbench/pipe2d/random-pair-v0.")],
     env: options.EnvironmentId = "eitbench/Pipe2D-v0",
-    seeds: Annotated[str, typer.Option(help="Episodes, such as train:0-999.")] = "train:0-99",
+    seeds: Annotated[str, typer.Option(help="Episode seeds, e.g. train:0-999.")] = "train:0-99",
     format: Annotated[Format, typer.Option(
         help="File format; hdf5 needs the extra export, minari the extra minari.")] = Format.npz,
     policy: Annotated[str | None, typer.Option(
-        help="Policy that injects, for minari: a built-in one, or the path of a file, which runs "
-             "in this process.")] = None,
+        help="Injection policy, for minari: a built-in name, or the path of a file, which runs in "
+             "this process.")] = None,
     jobs: options.Jobs = options.CORES,
     backend: options.Backends = options.Backend.loky,
 ) -> None:
-    """Write episodes as files to learn from: voltages, currents and the truth, one file each, with
-    a README that describes them and their score; or the observations, actions and rewards of a
-    policy as a Minari data set.
+    """Export episodes for training: voltages, currents and ground truth, one file per episode, with
+    a README that describes them and their score; or observations, actions and rewards of a policy
+    as a Minari data set.
 
-    Missing episodes are simulated. The same command again resumes; a Minari data set is written at
-    the end, and does not.
+    Missing episodes are simulated. The same command resumes; a Minari data set is written at the
+    end and cannot be resumed.
     """
     import eitbench
     with options.cli_errors():
@@ -90,7 +90,7 @@ def export(
             examples = eitbench.dataset(env, seeds)
             written = export_files(examples, Path(out), format.value, n_jobs=jobs, backend=backend)
             options.echo(f"{written} episodes written to {out}, {len(examples) - written} were "
-                        "there")
+                        "already stored")
 
 
 def train(
@@ -98,18 +98,18 @@ def train(
     algo: Annotated[Algorithm, typer.Option(
         help="Algorithm of stable-baselines3 or sb3-contrib.")] = Algorithm.ppo,
     config: Annotated[Path, typer.Option(
-        help="A YAML file such as those in baselines/rl.")] = Path("baselines/rl/ppo.yml"),
+        help="YAML configuration, e.g. a file of baselines/rl.")] = Path("baselines/rl/ppo.yml"),
     seed: Annotated[int, typer.Option(
-        min=0, help="Of the training; episodes are drawn from the train split.")] = 0,
+        min=0, help="Random seed of the training; episodes are from the train split.")] = 0,
     steps: Annotated[int | None, typer.Option(
-        min=0, help="Steps in place of the configuration's total_steps.")] = None,
+        min=0, help="Number of steps instead of the configuration's total_steps.")] = None,
     out: Annotated[Path | None, typer.Option(
         "--out", "-o", help="Folder of the run. Default: results/training/ENV/ALGO/seedK.")] = None,
 ) -> None:
     """Train an agent to choose injections.
 
-    The same command again goes on from the last checkpoint. The folder receives model.zip,
-    config.json, evaluations.npz (scores on dev episodes) and logs for TensorBoard.
+    The same command resumes from the last checkpoint. The folder receives model.zip, config.json,
+    evaluations.npz (scores on dev episodes) and logs for TensorBoard.
     """
     from dataclasses import replace
     with options.cli_errors():
@@ -128,18 +128,18 @@ def fit_prior(
     out: Annotated[Path, typer.Option("--out", "-o", help="File to write, JSON.")],
     seeds: Annotated[str, typer.Option(help="Episodes of the split train.")] = "train:0-199",
     link: Annotated[Link, typer.Option(
-        help="What is Gaussian: the inflow's logarithm, or the inflow.")] = Link.logarithm,
+        help="Gaussian quantity: the inflow's logarithm, or the inflow.")] = Link.logarithm,
     nugget: Annotated[float, typer.Option(
-        min=0.0, max=1.0, help="Part of the variance that is white in time.")] = 0.01,
+        min=0.0, max=1.0, help="Fraction of the variance that is white in time.")] = 0.01,
     kept: Annotated[float, typer.Option(
-        min=0.0, max=1.0, help="Modes across the inlet of less than this part of the variance are "
-                               "left out; each makes filters slower.")] = 1e-4,
+        min=0.0, max=1.0, help="Inlet modes with less than this fraction of the variance are "
+                               "omitted; each mode makes filters slower.")] = 1e-4,
     quiet: Annotated[float | None, typer.Option(
-        help="Learn how slugs begin and end too: a step is quiet if what is Gaussian is nowhere "
-             "beyond ± this.")] = None,
+        help="Also fit the onset and end of slugs: a step is quiet if the Gaussian quantity is "
+             "within ± this value at all nodes.")] = None,
 ) -> None:
-    """Learn what to expect of the inflow from training episodes, which are not simulated for it,
-    and write it as a prior for filters (`eitbench.estimation.InflowPrior`)."""
+    """Fit an inflow prior for filters (`eitbench.estimation.InflowPrior`) to the inflow of training
+    episodes, without simulating their transport."""
     from eitbench.data.seeds import parse_seeds
     from eitbench.estimation import fit_prior_from_episodes
     from eitbench.worlds.registry import entry
@@ -164,17 +164,17 @@ def fit_model(
     out: Annotated[Path, typer.Option("--out", "-o", help="File to write, npz.")],
     seeds: Annotated[str, typer.Option(help="Episodes of the split train.")] = "train:0-199",
     modes: Annotated[int, typer.Option(
-        min=1, help="Of the concentration; more of them make filters slower.")] = 64,
+        min=1, help="Number of concentration modes; more make filters slower.")] = 64,
     correct: Annotated[bool, typer.Option(
-        "--correct", help="Believe the flow as told, and learn only what that is off: needs fewer "
+        "--correct", help="Keep the task's flow model and fit only its residual; needs fewer "
                           "episodes.")] = False,
     linearised: Annotated[bool, typer.Option(
-        "--linearised", help="Linearise voltages once, about the homogeneous estimate, and learn "
-                             "how readings scatter about that.")] = False,
+        "--linearised", help="Linearise voltages once, about the homogeneous estimate, and fit the "
+                             "covariance of the residuals.")] = False,
 ) -> None:
-    """Learn from training episodes what an inflow leaves in the pipe, and by how much that and the
-    voltages are off, and write it for filters (`eitbench.estimation.IdentifiedModel`). Episodes
-    that are not there yet are simulated, on one core; `eitbench bank` does so on all."""
+    """Fit a model for filters (`eitbench.estimation.IdentifiedModel`) to training episodes: the
+    impulse response of the concentration to the inflow, and the residual statistics. Missing
+    episodes are simulated on one core; `eitbench bank` uses all cores."""
     from tqdm import tqdm
 
     import eitbench
@@ -189,6 +189,6 @@ def fit_model(
                if said})
         model.save(out)
     left = float(model.residual_covariance.trace() / examples.mass.sum())
-    options.echo(f"{out}: {modes} modes of the concentration, which remembers "
-                f"{model.impulse_response.shape[1]} inflows; {100 * left**0.5:.2g} % "
-                "(root mean square) is left")
+    options.echo(f"{out}: {modes} modes of the concentration, impulse response of "
+                f"{model.impulse_response.shape[1]} steps; root mean square residual "
+                f"{100 * left**0.5:.2g} %")

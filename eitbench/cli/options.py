@@ -1,4 +1,4 @@
-"""Options that several commands have, and how their mistakes are said."""
+"""Options of several commands, and their error messages."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ Isolation = StrEnum("Isolation", ["auto", "none", "process", "bubblewrap"])
 
 
 def resolve_path(path: Path | None) -> Path | None:
-    """The file or folder of an option, as `resolve_input` finds it."""
+    """Return the file or folder of an option; see `resolve_input`."""
     return path and resolve_input(path)
 
 
@@ -51,54 +51,54 @@ def import_env(env: str | list[str] | None) -> str | list[str] | None:
 _ENV_HELP = "id; module:id imports a module first, which registers it."
 Out = Annotated[Path, typer.Option("--out", "-o", help="Folder of the results.")]
 Jobs = Annotated[int, typer.Option(
-    "--jobs", "-j", min=1, help="Processes; each takes a core and 1 to 4 GB.")]
+    "--jobs", "-j", min=1, help="Number of processes; each needs a core and 1 to 4 GB.")]
 Backends = Annotated[Backend, typer.Option(
-    "--backend", help="Who starts the processes: loky on this machine; ray or dask (extra cluster) "
-                      "on the machines of one.")]
+    "--backend", help="Process backend: loky on this machine; ray or dask (extra cluster) on a "
+                      "cluster.")]
 Isolate = Annotated[Isolation, typer.Option(
-    help="How methods run. none: in this process. process: in a separate one. bubblewrap: in a "
-         "separate one that reads no files, truths or network. auto: built-in methods in this "
-         "process; a third-party file in a separate one, which for official runs and verification "
-         "must be confined by bubblewrap.")]
+    help="Isolation of methods. none: in this process. process: in a separate one. bubblewrap: in "
+         "a separate one without access to files, ground truth or network. auto: built-in methods "
+         "in this process; a third-party file in a separate one, which official runs and "
+         "verification confine by bubblewrap.")]
 Environments = Annotated[list[str] | None, typer.Option(
     help=f"Environment {_ENV_HELP} May be repeated.", callback=import_env)]
 EnvironmentId = Annotated[str, typer.Option(
     "--env", help=f"Environment {_ENV_HELP}", callback=import_env)]
 Records = Annotated[Path, typer.Option(
-    help="Folder of the records. Where there is none, those that come with the package.",
+    help="Folder of the records. If it is missing, the records of the package are used.",
     callback=resolve_path)]
 RECORDS = Path("leaderboards/results")
 METHODS = Path("leaderboards/methods")
-"""Where pull requests put the files of methods."""
+"""Folder of the files of submitted methods."""
 
 
 def parse_episodes(seeds: str | None) -> list[int] | None:
-    """The episodes that are asked for, None if nothing is; ``ValueError`` without a split."""
+    """Return the requested episodes, None without any; ``ValueError`` without a split."""
     from eitbench.data.seeds import parse_seeds
     if seeds is None:
         return None
     if seeds[:1].isdigit():
         asked = ", ".join(f"{split}:{seeds}" for split in ("train", "dev"))
-        raise ValueError(f"seeds must say of which split: {asked} or test:{seeds}; got {seeds!r}")
+        raise ValueError(f"seeds must have a split: {asked} or test:{seeds}; got {seeds!r}")
     return parse_seeds(seeds)
 
 
 def echo(text: object, *, err: bool = False) -> None:
-    """Print what may hold a stranger's words: nothing in them moves the cursor."""
+    """Print text that may contain third-party text, without control characters."""
     typer.echo(sanitize(str(text), lines=True), err=err)
 
 
 @contextmanager
 def cli_errors() -> Iterator[None]:
-    """Turn a ValueError about an argument, the loss of a process, an error in a worker, or a
-    missing extra into a message instead of a traceback."""
+    """Convert a ValueError about an argument, the loss of a process, an error in a worker, or a
+    missing extra to a message without a traceback."""
     try:
         yield
     except RuntimeError as error:
         from eitbench.bench.isolation import WorkerError
         if not isinstance(error, WorkerLostError | WorkerError):
             raise
-        echo(error, err=True)  # a traceback would show a stranger's words as they are
+        echo(error, err=True)  # a traceback would print third-party text unsanitised
         raise typer.Exit(1) from error
     except ModuleNotFoundError as error:
         if (sentence := missing_extra("this command", error)) is None:
@@ -110,7 +110,7 @@ def cli_errors() -> Iterator[None]:
 
 
 def report_differences(sentences: Iterable[str]) -> None:
-    """What differs, one a line; then, if anything does, exit status 1."""
+    """Print differences, one per line, and exit with status 1 if there are any."""
     wrong = list(sentences)
     for sentence in wrong:
         echo(f"differs: {sanitize(sentence)}", err=True)

@@ -1,4 +1,4 @@
-"""The command `run`: run methods, print the table and write the page."""
+"""Command `run`: run methods, print the table and write the page."""
 
 from __future__ import annotations
 
@@ -24,23 +24,22 @@ Suite = StrEnum("Suite", ["quick", "full"])
 def run(
     suite: Annotated[Suite, typer.Option(
         help="quick: the 2D pipe, test:0-3, four minutes on two cores; full: every estimation "
-             "environment, more seeds, slow methods too.")] = Suite.quick,
+             "environment, more seeds, also slow methods.")] = Suite.quick,
     env: options.Environments = None,
     baseline: Annotated[list[str] | None, typer.Option(
-        help="Name of a built-in estimator, or path of a .py file; may be repeated. Default: all "
+        help="Built-in estimator name, or path of a .py file; may be repeated. Default: all "
              "built-in ones.")] = None,
     policy: Annotated[list[str] | None, typer.Option(
-        help="Name of a built-in injection policy, or path of a .py file or of an agent's "
-             "model.zip; may be repeated. Default in injection environments: all built-in "
-             "ones.")] = None,
+        help="Built-in injection policy name, or path of a .py file or of an agent's model.zip; "
+             "may be repeated. Default in injection environments: all built-in ones.")] = None,
     seeds: Annotated[str | None, typer.Option(
-        help="Episodes, as in dev:0-9 or test:3. Default: the suite's.")] = None,
+        help="Episode seeds, e.g. dev:0-9 or test:3. Default: the suite's.")] = None,
     settings: Annotated[list[str] | None, typer.Option(
-        "--set", help="Change a number of the world, as in instrument.noise_relative=0.02; may be "
-                      "repeated. Several values, as in 0.01,0.02,0.05, are run one after the "
+        "--set", help="Change a number of the world, e.g. instrument.noise_relative=0.02; may be "
+                      "repeated. Several values, e.g. 0.01,0.02,0.05, are run one after the "
                       "other, with a table and a chart on the page.")] = None,
     estimator: Annotated[str, typer.Option(
-        help="Filter inside injection environments. full: exact, for scores; reduced: as in "
+        help="Filter inside injection environments. full: exact, for scores; reduced: for "
              "training.")] = "full",
     isolate: options.Isolate = options.Isolation.auto,
     jobs: options.Jobs = options.CORES,
@@ -48,13 +47,13 @@ def run(
     out: options.Out = Path("results"),
     records: Annotated[Path | None, typer.Option(
         callback=options.resolve_path,
-        help="For policies: folder of records whose episodes are not run again, such as "
+        help="For policies: folder of records whose episodes are not rerun, such as "
              "leaderboards/results.")] = None,
 ) -> None:
     """Run estimators or injection policies, print the table and write the page.
 
-    Each episode is stored when it is finished; the same command again resumes. The table shows
-    this run, the page all results in OUT. Below tables of policies stands the adaptivity gap.
+    Each episode is stored when it finishes; the same command resumes. The table shows this run,
+    the page all results in OUT. The normalised adaptivity gap is printed below tables of policies.
 
     Exit status 1 if all episodes of a method failed.
     """
@@ -96,9 +95,9 @@ def _track_of(env: list[str], baseline: list[str] | None, policy: list[str] | No
 
 def print_report(out: Path, asked: Sequence[Job] = (), worlds: Sequence[dict[str, Any]] = ({},),
            before: Sequence[dict[str, Any]] = ()) -> None:
-    """Print the table of what was ``asked`` for (default: of all that the folder holds) and write
-    Markdown and page of all; of several ``worlds`` that differ in a number, how errors follow it.
-    ``before`` are results of records that the table shows too."""
+    """Print the table of the given jobs (default: of all results in the folder) and write
+    Markdown and page of all results; for several ``worlds`` that differ in a number, print the
+    errors as a function of it. ``before`` are results of records, which the table includes."""
     from eitbench._files import write_atomically
     from eitbench.bench.store import EpisodeStore
     from eitbench.report.boards import anchors, bundled_anchors, run_leaderboards
@@ -110,7 +109,7 @@ def print_report(out: Path, asked: Sequence[Job] = (), worlds: Sequence[dict[str
     store = EpisodeStore(out)
     records = store.write_records()
     if not records and not before:
-        raise typer.BadParameter(f"no results in {out}; make some with `eitbench run`")
+        raise typer.BadParameter(f"no results in {out}; create some with `eitbench run`")
     known = {**bundled_anchors(records), **anchors(records)}
     boards = run_leaderboards(records, known)
     write_atomically(out / "leaderboard.md", markdown(boards).encode())
@@ -130,13 +129,13 @@ def print_report(out: Path, asked: Sequence[Job] = (), worlds: Sequence[dict[str
 
 
 def command_line() -> str:
-    """The command."""
+    """Return the command with its arguments."""
     return shlex.join(["eitbench", *sys.argv[1:]])
 
 
 def _say_failures(store: EpisodeStore, records: list[dict[str, Any]],
                   asked: Sequence[Job]) -> None:
-    """What went wrong, and how to look at it."""
+    """Print the failures, and a command to debug the first."""
     from eitbench.report.failures import debug_command, failures
     found = failures(store, records)
     for failure in found:
@@ -148,10 +147,10 @@ def _say_failures(store: EpisodeStore, records: list[dict[str, Any]],
 
 def _end_if_lost(asked: Sequence[Job], store: EpisodeStore,
                  before: Sequence[dict[str, Any]] = ()) -> None:
-    """Exit status 1 if there is a method that finished none of the episodes it was asked for."""
+    """Exit with status 1 if all episodes of a method failed."""
     from eitbench.bench.run import successful_results
     done = {job.method for job in successful_results(asked, [*before, *store.results()])}
     lost = dict.fromkeys(job.load().name for job in asked if job.method not in done)
     if lost:
-        options.echo(f"no episode was finished by {', '.join(lost)}", err=True)
+        options.echo(f"all episodes failed for {', '.join(lost)}", err=True)
         raise typer.Exit(1)

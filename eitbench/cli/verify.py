@@ -1,4 +1,4 @@
-"""The command `verify`: rerun episodes of records and compare."""
+"""Command `verify`: rerun episodes of records and compare."""
 
 from __future__ import annotations
 
@@ -17,21 +17,21 @@ def verify(
                                                           for path in paths or []])] = None,
     method: Annotated[str | None, typer.Option(
         "--method", "--baseline", "--policy",
-        help="File of the method. Default: the built-in one of that name, or the one with the "
-             "record's sha256 in the folder methods beside the records.")] = None,
+        help="File of the method. Default: the built-in one of that name, or the file with the "
+             "record's sha256 in the folder methods next to the records.")] = None,
     replay: Annotated[bool, typer.Option(
-        "--replay", help="Apply a policy's recorded actions; its code does not run.")] = False,
-    episodes: Annotated[int, typer.Option(min=0, help="Episodes of each record to rerun.")] = 3,
+        "--replay", help="Apply a policy's recorded actions without running it.")] = False,
+    episodes: Annotated[int, typer.Option(min=0, help="Episodes to rerun of each record.")] = 3,
     seed: Annotated[int | None, typer.Option(
-        min=0, help="Of their choice. Default: random; with --all 0.")] = None,
+        min=0, help="Random seed for choosing episodes. Default: random; 0 with --all.")] = None,
     tolerance: Annotated[float, typer.Option(
-        min=0.0, help="Relative difference of scores that is accepted.")] = 1e-6,
+        min=0.0, help="Relative tolerance for comparing scores.")] = 1e-6,
     isolate: options.Isolate = options.Isolation.auto,
     held_out: Annotated[int, typer.Option(
-        "--held-out", min=0, help="For maintainers: held-out episodes of each record, to test "
-                                  "whether the record is better.")] = 0,
+        "--held-out", min=0, help="Number of held-out episodes to compare each record with "
+                                  "(maintainers only).")] = 0,
     secret: Annotated[Path | None, typer.Option(
-        help="File of the secret from which held-out seeds follow; see docs/trust.md.")] = None,
+        help="File of the secret that determines held-out seeds; see docs/trust.md.")] = None,
     every: Annotated[bool, typer.Option(
         "--all", help="Verify every official record of the folder RECORDS.")] = False,
     top: Annotated[int, typer.Option(
@@ -42,11 +42,11 @@ def verify(
     backend: options.Backends = options.Backend.loky,
     out: Annotated[Path | None, typer.Option(
         "--out", "-o", help="Folder of results, with which the same command resumes. Default: "
-                            "results/verify with --all, else none is kept.")] = None,
+                            "results/verify with --all, else a temporary folder.")] = None,
 ) -> None:
-    """Rerun episodes of records, and compare every score.
+    """Rerun episodes of records and compare all deterministic scores.
 
-    Exit status 0 if all agree, 1 if one differs, 2 for wrong arguments. Episodes are simulated
+    Exit status 0 if all agree, 1 if one differs, 2 for invalid arguments. Episodes are simulated
     again; the cache is not used. A third-party method's file must have the record's sha256, and
     runs under bubblewrap unless --isolate process is given. Standard output is Markdown.
     """

@@ -1,4 +1,4 @@
-"""Learning to choose injections (extra ``rl``), and policies of trained agents."""
+"""Learning policies by reinforcement learning (layer 8; extra ``rl``), and policies of trained agents."""
 
 from eitbench.rl.agents import AgentPolicy, save_agent
 

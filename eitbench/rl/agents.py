@@ -1,4 +1,4 @@
-"""Trained agents as policies, from the folder that `eitbench train` writes."""
+"""Trained agents as policies, loaded from the folder that `eitbench train` writes."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class AgentPolicy:
     """
 
     estimator: ClassVar[str] = "reduced"
-    """Filter of the environment in which the agent was trained: "reduced" or "full"."""
+    """Filter of the environment in which the agent in trained: "reduced" or "full"."""
 
     def __init__(self, rules: Rules, random: np.random.Generator) -> None:
         self.rules = rules
@@ -143,9 +143,9 @@ def load_agent(path: Path, content: bytes) -> tuple[str, str, type[AgentPolicy],
     """Return name, title, policy and parameters of the model.zip at ``path`` with this ``content``.
 
     The name is ALGO_seedK for built-in agents, and ALGO_HASH_seedK, with a hash of the
-    configuration, for all others. Loading a model executes code, so the folder must hold its
-    ``sha256``, and a file with another digest is not loaded. ``ValueError`` if it differs, or if
-    ``config.json`` or ``sha256`` is missing.
+    configuration, for all others. Loading a model executes code, so its digest is first compared
+    with ``sha256`` in the folder. ``ValueError`` if it differs, or if ``config.json`` or ``sha256``
+    is missing.
     """
     try:
         asked = json.loads((path.parent / "config.json").read_text())
@@ -165,7 +165,7 @@ def load_agent(path: Path, content: bytes) -> tuple[str, str, type[AgentPolicy],
         "model": model, "uses_action_masks": algo.startswith("maskable"),
         "estimator": asked.get("kwargs", {}).get("estimator", "reduced")})
     built_in = (baseline_folder() / "checkpoints" / asked["env"].replace("/", "-") / algo
-                / f"seed{seed}" / "sha256")             # a copy elsewhere is built-in too
+                / f"seed{seed}" / "sha256")             # a copy of it is built-in too
     is_built_in = built_in.is_file() and built_in.read_text().split()[:1] == [found]
     mark = "" if is_built_in else f"_{configuration_hash(asked)}"
     parameters = {"env": asked["env"], **asked["config"]}
@@ -173,6 +173,6 @@ def load_agent(path: Path, content: bytes) -> tuple[str, str, type[AgentPolicy],
 
 
 def configuration_hash(asked: dict[str, Any]) -> str:
-    """Return six digits that identify the arguments of a training but its seed."""
+    """Return six digits that identify the arguments of a training except its seed."""
     rest = {name: value for name, value in asked.items() if name != "seed"}
     return hashlib.sha256(json.dumps(rest, sort_keys=True).encode()).hexdigest()[:6]

@@ -1,7 +1,7 @@
-"""Learn from a teacher before reinforcement: DAgger (Ross, Gordon & Bagnell 2011).
+"""Imitation learning from a teacher policy: DAgger (Ross, Gordon & Bagnell 2011).
 
-The pupil acts in training episodes, the teacher labels every observation with its action, and the
-pupil fits all labels so far by cross-entropy. The critic fits the returns of the episodes.
+The agent acts in training episodes, the teacher labels every observation with its action, and the
+agent is fitted to all labels so far by cross-entropy, its critic to the returns of the episodes.
 """
 
 from __future__ import annotations
@@ -30,13 +30,13 @@ def imitate(model: Any, world: InjectionEnv, options: dict[str, Any], reward_sca
     Parameters
     ----------
     world : InjectionEnv
-        With raw observations; its training episodes are used.
+        Environment with raw observations, whose training episodes are used.
     options : dict
         ``teacher`` (name or path of a policy), and optionally ``rounds``, ``episodes`` and
-        ``epochs`` (of a round), ``batch`` and ``learning_rate``. In the first round the teacher
-        acts, in the others the pupil.
+        ``epochs`` (per round), ``batch`` and ``learning_rate``. The teacher acts in the first
+        round, the agent in the others.
     reference : (episodes, steps), optional
-        Subtracted from the rewards, as in training.
+        Reward baseline that is subtracted, as in training.
     """
     settings = DEFAULTS | options
     teacher = load_method(str(options["teacher"]), "injection")
@@ -49,7 +49,7 @@ def imitate(model: Any, world: InjectionEnv, options: dict[str, Any], reward_sca
 
     labelled = []
     with tqdm(total=settings["rounds"] * settings["episodes"], unit="episode", disable=None,
-              desc=f"learning from {teacher.name}") as bar:
+              desc=f"imitating {teacher.name}") as bar:
         for turn in range(settings["rounds"]):
             for _ in range(settings["episodes"]):
                 episode = int(random.integers(world.pool.max_episodes))
@@ -68,7 +68,7 @@ def imitate(model: Any, world: InjectionEnv, options: dict[str, Any], reward_sca
 
 
 def load_compatible_policy(argument: str, name: str, rules: Rules) -> Method:
-    """Load the policy of this name or path; ``ValueError`` if it does not suit the rules."""
+    """Load the policy of this name or path; ``ValueError`` if it is incompatible with the rules."""
     loaded = load_method(name, "injection")
     if not loaded.suits(rules):
         raise ValueError(
@@ -77,7 +77,7 @@ def load_compatible_policy(argument: str, name: str, rules: Rules) -> Method:
 
 
 def check_imitation(algo: str, options: dict[str, Any], rules: Rules) -> None:
-    """``ValueError`` names an argument with which `imitate` cannot work."""
+    """Raise ``ValueError`` if an argument of `imitate` is invalid."""
     if set(options) - {*DEFAULTS, "teacher"} or "teacher" not in options:
         raise ValueError(
             f"imitate must hold teacher and may hold {', '.join(DEFAULTS)}; got {options!r}")
@@ -94,8 +94,8 @@ def check_imitation(algo: str, options: dict[str, Any], rules: Rules) -> None:
 
 def rollout(world: InjectionEnv, method: Method, episode: int, random: np.random.Generator,
             act: Callable[[np.ndarray], Any] | None = None) -> tuple[np.ndarray, ...]:
-    """Run an episode with a policy's actions, or those of ``act``; return (T, d) scaled
-    observations, the policy's actions (T, …), and rewards (T,)."""
+    """Run an episode with the actions of a policy or of ``act``; return scaled observations (T, d),
+    the policy's actions (T, …), and rewards (T,)."""
     observation, _ = world.reset(seed=episode)
     policy = method.make(world.rules, random, *[world.core] * method.privileged)
     seen, actions, rewards = [], [], []

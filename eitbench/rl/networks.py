@@ -1,7 +1,7 @@
-"""Policy networks over electrode pairs, whose logits share one term for each electrode.
+"""Policy networks over electrode pairs with shared terms of the logits for each electrode.
 
-A plain network would have to learn for each of an electrode's 15 pairs that it is dead; here the
-logit of a pair is the sum of a term of its source, a term of its sink, and a term of the pair.
+The logit of a pair is the sum of a term of its source, a term of its sink, and a term of the pair.
+A plain network would have to learn separately for all 15 pairs of an electrode that it is dead.
 """
 
 from __future__ import annotations
@@ -17,12 +17,12 @@ from torch import nn
 
 
 class PairLogits(nn.Module):
-    """Logits of all pairs of L electrodes, and of further actions, from h features; small at first.
+    """Logits of all pairs of L electrodes and of further actions from h features, initially small.
 
     Parameters
     ----------
     features, actions : int
-        h, and how many actions there are: L(L−1)/2 pairs and perhaps one more, no injection.
+        h, and the number of actions: L(L−1)/2 pairs and optionally one more, no injection.
     """
 
     incidence: torch.Tensor
@@ -46,7 +46,7 @@ class PairLogits(nn.Module):
 
 
 class PairPolicy(ActorCriticPolicy):
-    """For PPO."""
+    """Policy of PPO with `PairLogits`."""
 
     def _build(self, lr_schedule: Schedule) -> None:
         super()._build(lr_schedule)
@@ -54,7 +54,7 @@ class PairPolicy(ActorCriticPolicy):
 
 
 class MaskablePairPolicy(MaskableActorCriticPolicy):
-    """For PPO with masks."""
+    """Policy of PPO with action masks and `PairLogits`."""
 
     def _build(self, lr_schedule: Schedule) -> None:
         super()._build(lr_schedule)

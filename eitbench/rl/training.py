@@ -1,14 +1,14 @@
-"""Train an agent to choose injections with stable-baselines3; it resumes from its last checkpoint.
+"""Train an injection agent with stable-baselines3, resuming from the last checkpoint.
 
-A configuration is a YAML file such as those in ``baselines/rl/``. A run leaves in its folder:
+A configuration is a YAML file such as the files of ``baselines/rl/``. A run writes to its folder
 ``config.json`` (its arguments), ``model.zip`` (the agent), ``evaluations.npz`` (scores on dev
-episodes over time), ``sha256`` of the model, and TensorBoard's logs.
+episodes over time), ``sha256`` of the model, and logs for TensorBoard.
 
-Policies that a configuration names (``reference``, ``imitate.teacher``) run in this process,
-without isolation.
+Policies in a configuration (``reference``, ``imitate.teacher``) run in this process, without
+isolation.
 
-A resumed run draws other episodes and other noise than an uninterrupted one. A checkpoint holds the
-networks and the optimisers, but not the replay buffers of dqn and sac, which are empty again.
+The episodes and noise of a resumed run differ from an uninterrupted run. A checkpoint holds the
+networks and the optimisers, but not the replay buffers of dqn and sac, which start empty.
 """
 
 from __future__ import annotations
@@ -60,27 +60,27 @@ class TrainingConfig:
     """Entries of a configuration file."""
 
     total_steps: int
-    """environment steps of all environments together; ppo finishes the rollout that reaches them"""
+    """total steps of all environments; ppo finishes the rollout that reaches them"""
     n_envs: int = 16
-    """environments side by side"""
+    """number of parallel environments"""
     interval: int = 50_000
-    """steps between two checkpoints, at which the agent is evaluated too"""
+    """steps between checkpoints, at which the agent is also evaluated"""
     evaluation_episodes: int = 32
-    """dev episodes of an evaluation"""
+    """number of dev episodes in an evaluation"""
     episodes: int = 1000
-    """training episodes"""
+    """number of training episodes"""
     reward_scale: float = 100.0
     """factor of the rewards"""
     hidden: tuple[int, ...] = (256, 256)
-    """units of the networks' hidden layers"""
+    """numbers of units of the networks' hidden layers"""
     anneal: bool = False
-    """whether the learning rate decreases linearly to zero"""
+    """decrease the learning rate linearly to zero"""
     algorithm: dict[str, Any] = field(default_factory=dict)
     """further arguments of the algorithm in stable-baselines3"""
     reference: str = ""
-    """name or path of a policy, whose reward in the same episode is subtracted"""
+    """name or path of a policy whose reward in the same episode is subtracted (reward baseline)"""
     imitate: dict[str, Any] = field(default_factory=dict)
-    """arguments of imitation before reinforcement, such as ``teacher``; see `imitate`"""
+    """arguments of imitation learning before reinforcement, e.g. ``teacher``; see `imitate`"""
 
     def __post_init__(self) -> None:
         for name in ("total_steps", "n_envs", "interval", "evaluation_episodes", "episodes"):
@@ -102,10 +102,10 @@ class TrainingConfig:
 
 
 def read_config(path: str | Path) -> TrainingConfig:
-    """Read a YAML file, in which entries without a value have their default; a built-in one, such
-    as ``baselines/rl/ppo.yml``, is found from any folder.
+    """Read a YAML file; entries without a value have their default. The path of a built-in file,
+    such as ``baselines/rl/ppo.yml``, may be relative to any working folder.
 
-    ``ValueError`` names a missing file, and an entry that is unknown or wrong.
+    ``ValueError`` for a missing file, and for an unknown or invalid entry.
     """
     import yaml
     try:
@@ -125,7 +125,7 @@ def read_config(path: str | Path) -> TrainingConfig:
 
 @contextmanager
 def _one_thread() -> Iterator[None]:
-    """Limit BLAS and torch to one thread: with more, rounding depends on their number."""
+    """Limit BLAS and torch to one thread, since rounding depends on the number of threads."""
     before = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
@@ -146,13 +146,13 @@ def train(env: str, algo: str, config: TrainingConfig, seed: int, folder: Path,
         Id of an injection environment.
     algo : str
         One of `ALGORITHMS`.
-    config : Config
+    config : TrainingConfig
     seed : int
-        Of the networks, the exploration and the choice of training episodes.
+        Random seed of the networks, the exploration and the choice of training episodes.
     folder : Path
         Folder of the run; an interrupted run with the same arguments is resumed.
     kwargs : dict, optional
-        Of the environment.
+        Arguments of the environment.
     """
     if algo not in ALGORITHMS:
         raise ValueError(f"algo must be one of {', '.join(ALGORITHMS)}, got {algo!r}")
@@ -180,7 +180,7 @@ def train(env: str, algo: str, config: TrainingConfig, seed: int, folder: Path,
     else:
         model = ALGORITHMS[algo].load(latest, env=learning, **how)
         model.set_random_seed(seed + model.num_timesteps)  # loading restored the first seed
-    # written only now that all cheap checks have passed
+    # written after all cheap checks
     write_atomically(settings, json.dumps(asked, indent=1).encode())
     if config.reference:
         inner.reference = policy_rewards(config.reference, world, folder / "reference.npy")
@@ -204,7 +204,7 @@ def train(env: str, algo: str, config: TrainingConfig, seed: int, folder: Path,
 
 def vector_env(env: str, kwargs: dict[str, Any] | None, config: TrainingConfig,
                n_envs: int | None = None) -> InjectionVectorEnv:
-    """Build the vector environment; ``ValueError`` if ``env`` is no injection environment, or
+    """Build the vector environment; ``ValueError`` if ``env`` is not an injection environment, or
     ``kwargs`` hold arguments that training sets."""
     if entry(env).track != "injection":
         known = [id for id, each in entries().items() if each.track == "injection"]
@@ -219,7 +219,7 @@ def vector_env(env: str, kwargs: dict[str, Any] | None, config: TrainingConfig,
 
 
 def policy_rewards(policy: str, world: InjectionEnv, path: Path) -> np.ndarray:
-    """(episodes, steps) rewards of a policy in every training episode; stored at ``path``."""
+    """Compute or load from ``path`` the rewards (episodes, steps) of a policy in training."""
     if path.exists():
         return np.asarray(np.load(path))
     method = load_compatible_policy("reference", policy, world.rules)
@@ -234,8 +234,8 @@ def policy_rewards(policy: str, world: InjectionEnv, path: Path) -> np.ndarray:
 
 def make_evaluator(env: str, kwargs: dict[str, Any] | None,
                config: TrainingConfig) -> Callable[[BaseAlgorithm], np.ndarray]:
-    """Return a function that computes ẽ_c of a model's deterministic actions in each of the first
-    dev episodes, with the reduced filter."""
+    """Return a function that computes ẽ_c of a model with deterministic actions in each of the
+    first dev episodes, with the reduced filter."""
     seeds: Any = list(SPLITS["dev"])[:config.evaluation_episodes]
     envs = vector_env(env, kwargs, config, len(seeds))
 
@@ -252,7 +252,7 @@ def make_evaluator(env: str, kwargs: dict[str, Any] | None,
             observation, _, done, _, _ = envs.step(actions)
             errors.append(envs.errors())
             ended = bool(done.all())
-        # a state that is not scored is NaN in all episodes; a failed estimate is NaN in its own
+        # unscored states are NaN in all episodes, failed estimates in some
         scored = np.array([row for row in errors if not np.isnan(row).all()])
         return scored.mean(axis=0)
 
@@ -260,7 +260,7 @@ def make_evaluator(env: str, kwargs: dict[str, Any] | None,
 
 
 def _check_together(algo: str, config: TrainingConfig, world: InjectionEnv) -> None:
-    """``ValueError`` if algorithm, configuration and environment do not match."""
+    """Raise ``ValueError`` if algorithm, configuration and environment do not match."""
     numbered = isinstance(world.action_space, spaces.Discrete)
     if algo in (("sac",) if numbered else ("dqn", "maskable_ppo")):
         asks, takes = ("currents", "numbers") if numbered else ("numbers", "currents")
@@ -292,7 +292,7 @@ def _new_model(algo: str, config: TrainingConfig, learning: VecEnv, seed: int,
 
 
 def save_model(model: BaseAlgorithm, path: Path) -> None:
-    """Write a model as a compressed zip, atomically; stable-baselines3 compresses nothing."""
+    """Write a model as a compressed zip, atomically; stable-baselines3 does not compress it."""
     stored, content = io.BytesIO(), io.BytesIO()
     model.save(stored)
     with zipfile.ZipFile(stored) as source, zipfile.ZipFile(content, "w") as packed:
@@ -302,7 +302,7 @@ def save_model(model: BaseAlgorithm, path: Path) -> None:
 
 
 def _clear_optimisers(model: BaseAlgorithm) -> None:
-    """Drop the state of the optimisers, which is twice as large as the networks."""
+    """Clear the state of the optimisers, which is twice as large as the networks."""
     policy = model.policy
     for part in (policy, getattr(policy, "actor", None), getattr(policy, "critic", None)):
         if isinstance(optimiser := getattr(part, "optimizer", None), torch.optim.Optimizer):
@@ -310,7 +310,7 @@ def _clear_optimisers(model: BaseAlgorithm) -> None:
 
 
 class _Checkpoints(BaseCallback):
-    """Evaluate and store the agent at every interval and at the end."""
+    """Callback that evaluates and stores the agent at every interval and at the end."""
 
     def __init__(self, folder: Path, interval: int,
                  errors_of: Callable[[BaseAlgorithm], np.ndarray]) -> None:
@@ -333,8 +333,8 @@ class _Checkpoints(BaseCallback):
         save_model(self.model, self.folder / "latest.zip")
 
     def evaluate(self, model: BaseAlgorithm) -> np.ndarray:
-        """Append the errors (episodes,) to the table, in which they replace those after as many
-        steps or more, of checkpoints that were lost."""
+        """Append the errors (episodes,) to the table, and remove rows of the same or a larger
+        number of steps, which belong to lost checkpoints."""
         errors = self.errors_of(model)
         path = self.folder / "evaluations.npz"
         table = {"steps": np.zeros(0, int), "errors": np.zeros((0, len(errors)))}

@@ -13,7 +13,7 @@ from eitbench.envs.injection import InjectionVectorEnv
 
 
 class InjectionVecEnv(VecEnv):
-    """`InjectionVectorEnv` as a `VecEnv`: episodes end together, and the next ones begin at once.
+    """`InjectionVectorEnv` as a `VecEnv`: all episodes end together and are reset immediately.
 
     Parameters
     ----------
@@ -21,9 +21,9 @@ class InjectionVecEnv(VecEnv):
     reward_scale : float
         Factor of the rewards, which are of the order of 0.01.
     reference : (episodes, steps), optional
-        Rewards of another policy in each training episode, which are subtracted. Like the factor,
-        they do not depend on the actions, and change no optimum; they reduce the variance between
-        episodes.
+        Reward baseline: rewards of another policy in each training episode, which are subtracted.
+        Like the factor, it does not depend on the actions and does not change the optimal policy;
+        it reduces the variance between episodes.
     """
 
     def __init__(self, envs: InjectionVectorEnv, *, reward_scale: float = 1.0,
@@ -34,7 +34,7 @@ class InjectionVecEnv(VecEnv):
         super().__init__(envs.num_envs, envs.single_observation_space, envs.single_action_space)
 
     def reset(self) -> Any:
-        """Begin training episodes, drawn with the seed of ``seed(s)`` if it was called."""
+        """Start training episodes, sampled with the seed of ``seed(s)`` if it was called."""
         seeds: Any = None
         if self._seeds[0] is not None:
             size = self.envs.pool.size
@@ -64,7 +64,7 @@ class InjectionVecEnv(VecEnv):
 
     def env_method(self, method_name: str, *args: Any, indices: Any = None,
                    **kwargs: Any) -> list[Any]:
-        """Return an entry of `action_masks` for each environment."""
+        """Return the result of a method, e.g. `action_masks`, for each environment."""
         every = getattr(self.envs, method_name)(*args, **kwargs)
         return [every[k] for k in self._get_indices(indices)]
 

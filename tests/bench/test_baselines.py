@@ -1,4 +1,4 @@
-"""Loading baselines: what a file must hold, and what is said of those that do not."""
+"""Loading of estimators: required contents of a file, and error messages."""
 
 import json
 import os
@@ -10,8 +10,8 @@ from eitbench.bench.methods import MAX_METHOD_BYTES, builtin_methods, is_builtin
 from tiny import strict
 
 
-def test_our_baselines_load():
-    """Each of ours has a title, a board, a hash, and parameters that JSON can hold."""
+def test_built_in_methods_load():
+    """Each built-in method has a title, subtracks, a hash, and parameters that JSON can hold."""
     assert {"homogeneous", "kalman_filter", "fixed_interval_smoother", "gauss_newton"} <= {
         *builtin_methods("estimation")}
     for name in builtin_methods("estimation"):
@@ -28,10 +28,10 @@ def test_our_baselines_load():
 @pytest.mark.parametrize(("source", "message"), [
     ("x = 1", "must define a class Estimator with a method update"),
     ("class Estimator: pass", "Estimator must have a method update"),
-    ("class Estimator:\n  boards = ('filer',)\n  def update(self, V, I): pass", "boards must be some of filter"),
-    ("class Estimator:\n  boards = ()\n  def update(self, V, I): pass", "boards must be some of filter"),
-    ("class Estimator:\n  boards = 'filter'\n  def update(self, V, I): pass", "boards must be some of filter"),
-    ("class Estimator:\n  role = 'flor'\n  def update(self, V, I): pass", "role must be None, 'floor' or 'reference'"),
+    ("class Estimator:\n  boards = ('filer',)\n  def update(self, V, I): pass", "subtracks must be some of filter"),
+    ("class Estimator:\n  boards = ()\n  def update(self, V, I): pass", "subtracks must be some of filter"),
+    ("class Estimator:\n  boards = 'filter'\n  def update(self, V, I): pass", "subtracks must be some of filter"),
+    ("class Estimator:\n  role = 'flor'\n  def update(self, V, I): pass", "role must be among None"),
     ("class Estimator:\n  parameters = {'a': {1}}\n  def update(self, V, I): pass", "fit for JSON"),
     ("class Estimator:\n  parameters = {'a': 'b' * 10_000}\n  def update(self, V, I): pass", "at most 10000 bytes"),
     ("class Estimator:\n  parameters = {'a': 10**400}\n  def update(self, V, I): pass", "fit for JSON"),
@@ -41,8 +41,8 @@ def test_our_baselines_load():
     ("import no_such_package", "no_such_package"),
     ("def broken(:", "invalid syntax"),
 ])
-def test_files_that_are_no_baselines(source, message, tmp_path):
-    """The message names the file and what it lacks."""
+def test_invalid_files_are_reported(source, message, tmp_path):
+    """The message names the file and the missing part."""
     path = tmp_path / "mine.py"
     path.write_text(source)
     with pytest.raises(ValueError, match=message) as caught:
@@ -51,7 +51,7 @@ def test_files_that_are_no_baselines(source, message, tmp_path):
 
 
 def test_unknown_baselines(tmp_path):
-    """A name that is none of ours: the message lists ours. A file that is too large is not read."""
+    """The message lists built-in names. A file that is too large is not read."""
     path = tmp_path / "mine.py"
     path.touch()
     os.truncate(path, MAX_METHOD_BYTES + 1)
@@ -67,14 +67,14 @@ def test_unknown_baselines(tmp_path):
     "My filter"), ('"""\nMy filter\n\nLong story.\n"""', "My filter"), ("", "mine"), ('"""  """', "mine"),
     (f'"""{150 * "x"}"""', 120 * "x")])
 def test_titles(docstring, title, tmp_path):
-    """The docstring's first line up to a colon, bracket or full stop; without one, the file's name."""
+    """The title ends at the first colon, bracket, full stop or line end; without a docstring it is the file's name."""
     path = tmp_path / "mine.py"
     path.write_text(docstring + "\nclass Estimator:\n    def update(self, V, I): pass\n")
     assert load_method(str(path), "estimation").title == title
 
 
 def test_baselines_may_use_dataclasses(tmp_path):
-    """A file with deferred annotations and a dataclass, as modern code has them, loads like an imported one."""
+    """A file with deferred annotations and a dataclass can be loaded."""
     path = tmp_path / "mine.py"
     path.write_text("from __future__ import annotations\nfrom dataclasses import dataclass\n@dataclass\n"
                     "class Estimator:\n    task: object\n    def update(self, V, I): pass\n")
@@ -82,9 +82,9 @@ def test_baselines_may_use_dataclasses(tmp_path):
 
 
 @pytest.mark.parametrize("track", ["estimation", "injection"])
-def test_only_registered_names_are_ours(track, tmp_path, monkeypatch):
-    """A path without .py leads nowhere, be there a file of that name with it; a link is what it
-    leads to; a name of ours in another folder is refused."""
+def test_only_registered_names_are_built_in(track, tmp_path, monkeypatch):
+    """A path without .py is not a method, even if the file with .py exists; a link is resolved to its target; a file
+    with a built-in name in another folder is rejected."""
     ours = builtin_methods(track)[0]
     path = tmp_path / "insider.py"
     path.write_text("raise SystemExit('executed')")
@@ -98,5 +98,5 @@ def test_only_registered_names_are_ours(track, tmp_path, monkeypatch):
     link = tmp_path / f"{ours}.py"
     link.symlink_to(path)
     assert not is_builtin(str(link))
-    with pytest.raises(ValueError, match="has the name of one of ours"):
+    with pytest.raises(ValueError, match="has the name of a built-in method"):
         load_method(str(link), track)

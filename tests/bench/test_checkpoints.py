@@ -1,4 +1,4 @@
-"""Our trained agents: each is whole, loads, and plays as it did when it was kept."""
+"""Built-in agents: checkpoints are complete, can be loaded, and reproduce their evaluations."""
 
 import io
 import json
@@ -17,17 +17,17 @@ from injection_envs import injected
 FOLDER = baseline_folder() / "checkpoints"
 AGENTS = [path for env in ids("injection") for path in builtin_agents(env)]
 FIRST = 100_000
-"""The first dev episode, with which evaluations begin."""
+"""The first dev episode, which every evaluation contains."""
 
 
 def test_every_checkpoint_is_an_agent_of_an_environment():
-    """None lies where nobody finds it, and all together stay small enough for git."""
+    """All checkpoints are in the folders of registered environments, and their total size is small enough for git."""
     assert sorted(AGENTS) == sorted(map(str, FOLDER.glob("**/model.zip")))
     assert sum(path.stat().st_size for path in FOLDER.glob("**/*") if path.is_file()) < 20e6
 
 
-def test_no_checkpoint_remembers_its_optimiser():
-    """Its moments have twice the size of the networks; who goes on with a training has its latest.zip."""
+def test_checkpoints_do_not_contain_the_optimiser():
+    """The optimiser's moments are twice as large as the networks; training resumes from latest.zip."""
     torch = pytest.importorskip("torch")
     for path in FOLDER.glob("**/model.zip"):
         with zipfile.ZipFile(path) as file:
@@ -36,8 +36,8 @@ def test_no_checkpoint_remembers_its_optimiser():
 
 
 @pytest.mark.parametrize("path", AGENTS, ids=lambda path: "-".join(path.split("/")[-4:-1]))
-def test_an_agent_plays_as_it_did_when_it_was_kept(path):
-    """Its error in the first dev episode is that of its last evaluation; rounding may turn a close choice."""
+def test_agents_reproduce_their_evaluation(path):
+    """The error in the first dev episode equals the last evaluation; rounding may change a close decision."""
     folder, agent = FOLDER.joinpath(*path.split("/")[-4:-1]), load_method(path, "injection")
     asked = json.loads((folder / "config.json").read_text())
     assert agent.name == f"{asked['algo']}_{folder.name}" and folder.parts[-2] == asked["algo"]
@@ -49,8 +49,8 @@ def test_an_agent_plays_as_it_did_when_it_was_kept(path):
 
 
 @pytest.mark.skipif(not AGENTS, reason="needs the extra rl")
-def test_somebody_s_agent_plays_in_a_guest(tmp_path):
-    """A copy that lies elsewhere: unpickled in a process of its own, it does what it does here."""
+def test_a_copied_agent_runs_in_a_worker(tmp_path):
+    """A copy elsewhere, unpickled in a separate process, has the same results as in this process."""
     folder = shutil.copytree(FOLDER.joinpath(*AGENTS[0].split("/")[-4:-1]), tmp_path / "theirs")
     asked = json.loads((folder / "config.json").read_text())
     job = Job(Environment(asked["env"], json.dumps({"estimator": "reduced"})), str(folder / "model.zip"), FIRST)
@@ -58,6 +58,6 @@ def test_somebody_s_agent_plays_in_a_guest(tmp_path):
         here, there = (run_episode(job._replace(isolation=kind))[0] for kind in ("none", "process"))
     finally:
         isolation.close()
-    assert here["method"] == there["method"] == f"{asked['algo']}_seed{asked['seed']}"          # it is still ours
+    assert here["method"] == there["method"] == f"{asked['algo']}_seed{asked['seed']}"          # a copy is built-in
     assert here["status"] == "ok" and here["step_errors"] == there["step_errors"]
     assert here["checkpoint_sha256"] == there["checkpoint_sha256"] and there["peak_memory"] > 50e6

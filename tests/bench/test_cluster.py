@@ -1,7 +1,7 @@
-"""Runs on a cluster: the same records as here, and a worker that is killed costs nothing.
+"""Runs on a cluster give the same records as local runs, also if a worker is killed.
 
-Those of ray and dask need the extra cluster: `pip install -c constraints.txt -e '.[test,cluster]'`, then
-`python -m pytest -m cluster`.
+Tests of ray and dask need the extra cluster: `pip install -c constraints.txt -e '.[test,cluster]'`, then `python -m
+pytest -m cluster`.
 """
 
 import importlib
@@ -19,7 +19,7 @@ from tiny import FILTER, count, write_baseline
 CLUSTERS = {"ray": "ray", "dask": "distributed"}
 KILL = ("open({log!r}, 'a').write('made\\n'); "
         "len(open({log!r}).readlines()) == 2 and os.kill(os.getpid(), 9)")
-"""The second estimator that is made kills its process."""
+"""Estimator whose second instance kills its process."""
 
 
 @pytest.fixture(autouse=True)
@@ -34,20 +34,20 @@ def errors(store):
 
 @pytest.mark.cluster
 @pytest.mark.parametrize("backend", CLUSTERS)
-def test_a_cluster_plays_on_when_a_worker_is_killed(backend, tmp_path):
-    """Two workers, of which one is killed; every episode is there in the end, with the scores of this process."""
+def test_a_cluster_continues_when_a_worker_is_killed(backend, tmp_path):
+    """One of two workers is killed; in the end every episode is stored, with the scores of a run in this process."""
     pytest.importorskip(CLUSTERS[backend])
     log, store = tmp_path / "log", EpisodeStore(tmp_path / "results")
     path = write_baseline(tmp_path, init=KILL.format(log=str(log)), update="return Estimate(self.level + voltages[0])")
     jobs = [Job(FILTER, path, seed) for seed in (1, 2, 3, 4)]
     run_jobs(jobs, store, n_jobs=2, backend=backend)
-    assert count(log) >= 5                                             # the killed one's work was begun again
+    assert count(log) >= 5                                             # the killed worker's episode was started again
     assert errors(store) == {("mine", f"train:{job.seed}"): run_episode(job)[0]["step_errors"] for job in jobs}
 
 
 @pytest.mark.cluster
-def test_what_a_method_prints_in_ray_is_passed_on(tmp_path, capsys):
-    """By those that run in its workers, and by workers of these."""
+def test_output_of_methods_in_ray_is_printed(tmp_path, capsys):
+    """Output of methods in ray's workers, and in isolated processes started by them, is printed."""
     pytest.importorskip("ray")
     path = write_baseline(tmp_path, init="print('made')")
     run_jobs([Job(FILTER, path, 1), Job(FILTER, path, 2, "process")], EpisodeStore(tmp_path / "results"), n_jobs=2,
@@ -68,8 +68,8 @@ def test_methods_are_isolated_in_a_cluster(backend, tmp_path):
         ("mine", f"train:{job.seed}"): run_episode(job._replace(isolation="none"))[0]["step_errors"] for job in jobs}
 
 
-def test_here_a_killed_worker_ends_the_run_and_nothing_is_lost(tmp_path):
-    """The message says how to go on; the same run again plays what is missing."""
+def test_without_a_cluster_a_killed_worker_ends_the_run_without_losses(tmp_path):
+    """The message explains how to resume; the same run again runs only missing episodes."""
     log, store = tmp_path / "log", EpisodeStore(tmp_path / "results")
     path = write_baseline(tmp_path, init=KILL.format(log=str(log)))
     jobs = [Job(FILTER, path, seed) for seed in (1, 2, 3)]
@@ -82,8 +82,8 @@ def test_here_a_killed_worker_ends_the_run_and_nothing_is_lost(tmp_path):
     assert len(errors(store)) == 3 and count(log) == before + 3 - finished
 
 
-def test_backends_that_cannot_be_had(monkeypatch):
-    """Unknown, or not installed: a sentence."""
+def test_unavailable_backends_are_reported(monkeypatch):
+    """Unknown or missing backends have an error message."""
     with pytest.raises(ValueError, match="backend must be one of loky, ray, dask, got 'slurm'"):
         list(run_parallel(print, [(1,)], 1, "slurm"))
     with monkeypatch.context() as patch, pytest.raises(ModuleNotFoundError):
@@ -97,7 +97,7 @@ def test_backends_that_cannot_be_had(monkeypatch):
 
 
 def test_loky_is_silent_when_it_renews_a_worker(recwarn):
-    """Of loky's warnings this one alone is left out, and nobody else's of the same words."""
+    """Only this warning of loky is suppressed; the same text from other modules is not."""
     def warn(words, module):
         warnings.warn_explicit(words, UserWarning, "file.py", 1, module)
 

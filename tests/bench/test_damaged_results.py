@@ -1,4 +1,4 @@
-"""A folder of results in which something is damaged: it is named, and the rest becomes a table and a page."""
+"""Damaged files in a folder of results are reported; table and page show the rest."""
 
 import json
 import re
@@ -29,7 +29,7 @@ def two_methods(tmp_path_factory):
 
 @pytest.fixture
 def played(two_methods, monkeypatch, tmp_path):
-    """The results of one method in a copy of that folder, where the environment is the same short one."""
+    """The results of one method in a copy of that folder, with the same shortened environment."""
     shorten(monkeypatch, {FILTER.id: SCENARIO})
     monkeypatch.chdir(tmp_path)
     shutil.copytree(two_methods, tmp_path / "results")
@@ -41,11 +41,11 @@ def played(two_methods, monkeypatch, tmp_path):
     ("environment", "Pipe2D"), ("environment", {"id": 5, "name": "a", "kwargs": {}}), ("run", {}), ("run", None),
     ("method", ["mine"]), ("seed", 7), ("version", None), ("scores", {"error": 10**400}),
     ("scores", {"error": 0.1, "seconds_per_step": -1.0}), *((None, text) for text in ("", "{", "[]", "{}", "3"))])
-def test_a_damaged_result_is_named_and_the_others_are_kept(field, value, played):
-    """Whatever is in the place of a text, a number, an object, or of the whole."""
+def test_a_damaged_result_is_reported_and_the_others_are_kept(field, value, played):
+    """Any value in place of a text, a number, an object or the whole file is handled."""
     path = played / "dev-0.json"
     path.write_text(json.dumps(json.loads(path.read_text()) | {field: value}) if field else value)
-    with pytest.warns(UserWarning, match=r"mine/dev-0\.json is left out: it (cannot be read|is no|is not valid)"):
+    with pytest.warns(UserWarning, match=r"mine/dev-0\.json is left out: it (cannot be read|is not (an ep|valid))"):
         records = EpisodeStore(played.parents[2]).write_records()
         assert not EpisodeStore(played.parents[2]).has_result("eitbench-Pipe2D-v0", "mine", 100_000, "any")
     assert {record["method"]: record["seeds"] for record in records} == {
@@ -53,7 +53,7 @@ def test_a_damaged_result_is_named_and_the_others_are_kept(field, value, played)
 
 
 def test_the_others_are_shown(played):
-    """By the command, in the table; arguments that an environment does not have are named."""
+    """The command shows the other results in the table, and reports unknown arguments of an environment."""
     for path in played.glob("dev-0.json"):
         result = json.loads(path.read_text())
         path.write_text(json.dumps(result | {"environment": result["environment"] | {"kwargs": {"scenario": 5}}}))
@@ -68,7 +68,7 @@ def test_the_others_are_shown(played):
     # marked as encrypted
     lambda data: re.sub(rb"(PK\x01\x02.{4}).", lambda found: found[1] + b"\x01", data, flags=re.DOTALL)])
 def test_damaged_estimates_are_named(damage, played):
-    """With their file."""
+    """The message names the file."""
     store = EpisodeStore(played.parents[2])
     (result,) = [result for result in store.results() if (result["method"], result["seed"]) == ("mine", "dev:0")]
     path = played / "dev-0.npz"
@@ -81,7 +81,7 @@ def test_damaged_estimates_are_named(damage, played):
     {"mean": np.zeros(3)}, {"mean": np.full((5, 7), np.nan)}, {"mean": np.array([["a"]])}, {"mean": np.zeros((5, 7))},
     {"std": np.zeros((5, 7))}])
 def test_estimates_of_another_shape_are_not_drawn(fields, played):
-    """The table and the page are made without pictures."""
+    """Table and page are written without figures."""
     for path in played.glob("*.npz"):
         np.savez(path, **fields)
     with pytest.warns(UserWarning, match="no pictures of dev:0"):
@@ -89,21 +89,21 @@ def test_estimates_of_another_shape_are_not_drawn(fields, played):
     assert code == 0 and "| mine" in said, complaint
 
 
-def test_results_that_are_no_files_are_named(played):
-    """A folder in the place of a result is left alone, and no obstacle."""
+def test_results_that_are_not_files_are_reported(played):
+    """A folder in place of a result is ignored."""
     (played / "dev-7.json").mkdir()
     with pytest.warns(UserWarning, match=r"dev-7\.json is left out"):
         assert len(list(EpisodeStore(played.parents[2]).results())) == 4
 
 
-def test_an_exception_s_words_move_no_cursor(tmp_path, monkeypatch):
-    """A method's title and message reach the terminal, the table and the page spelt out."""
+def test_control_characters_of_an_exception_are_escaped(tmp_path, monkeypatch):
+    """Control characters in a method's title and message are escaped in the terminal, the table and the page."""
     shorten(monkeypatch, {FILTER.id: SCENARIO})
     monkeypatch.chdir(tmp_path)
     write_baseline(tmp_path, "loud", doc="Loud *",
-                   update="raise ValueError('\\x1b[2J\\u202eall well\\nfailed: nobody')")
+                   update="raise ValueError('\\x1b[2J\\u202eall well\\nfailed: nothing')")
     code, said, complaint = eitbench("run", "--baseline", "loud.py", "--env", FILTER.id, "--seeds", "dev:0", "-j", 1)
-    words = r"failed: loud in eitbench/Pipe2D-v0 on dev:0: ValueError: \x1b[2J\u202eall well\nfailed: nobody"
+    words = r"failed: loud in eitbench/Pipe2D-v0 on dev:0: ValueError: \x1b[2J\u202eall well\nfailed: nothing"
     assert code == 1 and words in complaint
     page = (tmp_path / "results" / "index.html").read_text()
     table = (tmp_path / "results" / "leaderboard.md").read_text()

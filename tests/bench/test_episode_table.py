@@ -1,4 +1,4 @@
-"""The table of episodes that a package ships: it says of every score what the records say."""
+"""The table of episodes in the package has the same scores as the records."""
 
 import gzip
 import re
@@ -17,15 +17,15 @@ from tiny import several_boards
 RESULTS = bundled_path("leaderboards") / "results"
 
 
-def test_the_published_table_is_that_of_the_records():
-    """`eitbench leaderboard --records leaderboards/results` would change nothing, and `load` gives one frame."""
+def test_the_published_table_agrees_with_the_records():
+    """`eitbench leaderboard --records leaderboards/results` would not change it, and `load` returns the same data."""
     text = gzip.decompress((RESULTS.parent / TABLE_NAME).read_bytes()).decode()
     assert text == episode_table(read_records(RESULTS)), "run `eitbench leaderboard --records leaderboards/results`"
     pd.testing.assert_frame_equal(load(RESULTS.parent / "none"), load(), check_exact=True)
 
 
 def test_published_records_name_no_folder_of_a_machine():
-    """Neither in the command nor anywhere else."""
+    """The command and all other fields contain no paths of a machine."""
     texts = [path.read_text(encoding="utf-8") for path in RESULTS.glob("*.json")]
     assert len(texts) >= 319
     for text in texts:
@@ -33,7 +33,7 @@ def test_published_records_name_no_folder_of_a_machine():
 
 
 def test_records_come_back(tmp_path):
-    """All that a comparison needs: floors, failures, odd names, scores that are missing."""
+    """The table preserves naive baselines, failures, unusual names and missing scores."""
     written = several_boards()
     write_episode_table(written, tmp_path / TABLE_NAME)
     read = read_episode_table(tmp_path / TABLE_NAME)
@@ -52,7 +52,7 @@ def test_records_come_back(tmp_path):
 
 
 def test_compare_and_skill_need_no_records(tmp_path, monkeypatch):
-    """Where only the table is, methods are compared as in a checkout."""
+    """Methods are compared as in a checkout if only the table exists."""
     folder = tmp_path / "results"
     (tmp_path / TABLE_NAME).write_bytes((RESULTS.parent / TABLE_NAME).read_bytes())
 
@@ -71,7 +71,7 @@ def test_compare_and_skill_need_no_records(tmp_path, monkeypatch):
     lambda data: data[:-9], lambda data: b"no gzip", lambda data: gzip.compress(b"a\n1\n"),
     lambda data: gzip.compress(gzip.decompress(data)[:-3] + b"x,y\n")])
 def test_a_damaged_table_is_named(damage, tmp_path):
-    """With its path."""
+    """The message contains the path."""
     write_episode_table(several_boards(), tmp_path / TABLE_NAME)
     (tmp_path / TABLE_NAME).write_bytes(damage((tmp_path / TABLE_NAME).read_bytes()))
     with pytest.raises(ValueError, match=rf"table of episodes .*{TABLE_NAME} cannot be read"):

@@ -1,4 +1,4 @@
-"""`eitbench.evaluate`: the numbers of the commands, from Python, of classes, names and files."""
+"""`eitbench.evaluate`: the scores of the commands, in Python, for classes, names and files."""
 
 import contextlib
 import os
@@ -23,7 +23,7 @@ def tiny_world(monkeypatch):
 
 
 class Level:
-    """The same everywhere, as loud as the voltages."""
+    """Homogeneous estimate: a constant plus the sum of the voltages."""
 
     def __init__(self, task):
         self.level = np.full(task.mesh.n_nodes, 29.0)
@@ -36,8 +36,8 @@ def without_time(table):
     return table.drop(columns=["seconds_per_step", "method"])
 
 
-def test_the_numbers_are_those_of_the_commands(tmp_path):
-    """Of a class, of the file that holds it, of a made environment, and in two processes."""
+def test_scores_agree_with_the_commands(tmp_path):
+    """The scores agree for a class, for its file, for an environment that was made before, and in two processes."""
     table = eitbench.evaluate(Level, FILTER.id, "dev:0-2", world=SCENARIO)
     assert table["seed"].tolist() == ["dev:0", "dev:1", "dev:2"] and set(table["method"]) == {"Level"}
     path = write_baseline(tmp_path, update="return Estimate(self.level + voltages.sum())")
@@ -53,7 +53,7 @@ def test_the_numbers_are_those_of_the_commands(tmp_path):
 
 
 def test_policies_too():
-    """Ours by name, and a class of one's own."""
+    """A built-in policy by name, and a user's class."""
     class First:
         def __init__(self, rules, random):
             self.limit = rules.limit
@@ -67,8 +67,8 @@ def test_policies_too():
     assert (ours["error"] != mine["error"]).all()
 
 
-def test_what_the_method_raises_is_seen():
-    """Its own exception, with a note of where."""
+def test_exceptions_of_the_method_propagate():
+    """The method's exception propagates, with a note that names the episode."""
     class Fails(Level):
         def update(self, voltages, currents):
             raise ZeroDivisionError("dry")
@@ -78,8 +78,8 @@ def test_what_the_method_raises_is_seen():
     assert caught.value.__notes__ == ["Fails on eitbench/Pipe2D-v0, dev:0"]
 
 
-def test_a_file_is_isolated_if_asked_for(tmp_path):
-    """It scores the same, in another process; a class cannot be isolated."""
+def test_a_file_is_isolated_on_request(tmp_path):
+    """An isolated file has the same scores in another process; a class cannot be isolated."""
     log = tmp_path / "log"
     init = f"print(os.getpid(), file=open({str(log)!r}, 'w'))"
     path = write_baseline(tmp_path, update="return Estimate(self.level + voltages.sum())")
@@ -90,7 +90,7 @@ def test_a_file_is_isolated_if_asked_for(tmp_path):
     eitbench.evaluate(spy, FILTER.id, "dev:0", world=SCENARIO)
     assert int(log.read_text()) == os.getpid()
     log.unlink()
-    with contextlib.suppress(RuntimeError):                       # where it may not write, that is its failure
+    with contextlib.suppress(RuntimeError):                       # writing may be forbidden
         eitbench.evaluate(spy, FILTER.id, "dev:0", world=SCENARIO, isolate="process")
     assert not log.exists() or int(log.read_text()) != os.getpid()
     with pytest.raises(ValueError, match="method must be a name or a path to be isolated, got type"):

@@ -1,8 +1,8 @@
-"""Golden files: numbers of every world and method agree with them, a constant off by 0.1 % shows, and a damaged file
-is reported.
+"""Golden files: numbers of every world and method agree with them, a constant changed by 0.1 % is detected, and a
+damaged file is reported.
 
-The default run computes one shortened episode of each world and method; `pytest -m slow` all of them. Worlds that
-share a fluid follow each other, and so do methods that run in one environment: what they share is computed once.
+The default run computes one shortened episode of each world and method; `pytest -m slow` all of them. Worlds with the
+same fluid are consecutive, and so are methods of one environment, so that shared data are computed once.
 """
 
 import json
@@ -32,13 +32,13 @@ def some(names, is_slow):
 @pytest.mark.parametrize("name", [*some(BY_FLUID, lambda id: "3D" in id),
                                   *some(BY_ENVIRONMENT, lambda name: name in SLOW)])
 def test_shortened_episode_agrees_with_the_golden_file(name):
-    """Other numbers need a new version of the id or method. In three dimensions this takes minutes."""
+    """Other numbers require a new version of the id or method. In three dimensions this takes minutes."""
     assert not golden.check(name, is_quick=True)
 
 
 @pytest.mark.parametrize("id", [id for id in BY_FLUID if "3D" in id])
 def test_first_observations_agree_with_the_golden_file(id):
-    """The part of a world in three dimensions that takes seconds."""
+    """For worlds in three dimensions these tests take seconds only."""
     computed = json.loads(golden.world_text(golden.first_observations(id, "train:0")))
     assert not golden.differences(computed, golden.read_golden(id)["observations"]["train:0"])
 
@@ -46,7 +46,7 @@ def test_first_observations_agree_with_the_golden_file(id):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", [*BY_FLUID, *BY_ENVIRONMENT])
 def test_all_episodes_agree_with_the_golden_file(name):
-    """Errors that build up over an episode show here."""
+    """Errors that accumulate over an episode are detected here."""
     assert not golden.check(name)
 
 
@@ -78,7 +78,7 @@ def test_versions_of_built_in_methods_are_those_of_their_golden_files(monkeypatc
     pytest.param("eitbench/Pipe2DObstacle-v0", "flow", "viscosity",
                  {"episodes.train:0.moment", "episodes.train:0.resistance"}, "model", marks=pytest.mark.slow)])
 def test_constant_off_by_a_thousandth_shows(id, part, name, shows, stays):
-    """In the numbers that depend on it, and in no other."""
+    """Only the numbers that depend on the constant change."""
     value = getattr(getattr(entry(id).world, part), name)
     world = entry(id).world.with_changes({part: {name: 1.001 * value}})
     computed = json.loads(golden.world_text(golden.world_numbers(world, ("train:0",))))
@@ -90,7 +90,7 @@ def test_constant_off_by_a_thousandth_shows(id, part, name, shows, stays):
 
 @pytest.fixture
 def copy(tmp_path, monkeypatch):
-    """A golden file in a folder of this test, of a world that is not simulated again."""
+    """A copy of a golden file in a folder of this test, of a world that is not simulated again."""
     content = golden.read_golden(PLAIN)
     monkeypatch.setattr(golden, "WORLD_FOLDER", tmp_path)
     monkeypatch.setattr(golden, "world_golden", lambda id, is_quick: content)
@@ -99,7 +99,7 @@ def copy(tmp_path, monkeypatch):
 
 
 def test_missing_and_damaged_files_are_reported(copy):
-    """With the id and the path, without a traceback."""
+    """The message has the id and the path, without a traceback."""
     assert golden.check(PLAIN) == []
     text = copy.read_text()
     for damaged in (text[:len(text) // 2], "", text.replace("[", "(", 1), "\ud800" + text):
@@ -112,7 +112,7 @@ def test_missing_and_damaged_files_are_reported(copy):
 
 
 def moved(by):
-    """A change of one voltage relative to the largest."""
+    """Change one voltage relative to the largest."""
     def change(content):
         voltages = content["episodes"]["dev:0"]["voltages"]
         voltages[2] += by * max(map(abs, voltages))
@@ -128,7 +128,7 @@ def moved(by):
     (lambda made: made["episodes"].update({"dev:0": []}), "episodes.dev:0 is"),
     (moved(0.01), "episodes.dev:0.voltages differs by 0.01 of its largest"), (moved(0.5 * golden.RTOL_FLOAT64), "")])
 def test_difference_is_reported(change, message, copy):
-    """The number, name or kind that differs; not a difference within the tolerance."""
+    """Other numbers, names and types are reported, but not a difference within the tolerance."""
     content = golden.read_golden(PLAIN)
     change(content)
     copy.write_text(json.dumps(content))
@@ -153,8 +153,8 @@ def method_files(monkeypatch, tmp_path):
     ("homogeneous", lambda episode: episode["scores"].update(beauty=1.0), "beauty is None, expected 1.0"),
     ("homogeneous", lambda episode: episode["last"].__setitem__(0, 1.01 * episode["last"][0]), "last differs by "),
     ("best_pair", lambda episode: episode["injections"].__setitem__(0, [0, 1]), "injections is ")])
-def test_numbers_that_moved_are_written_only_as_a_new_version(name, change, message, method_files):
-    """Exit status 1 with the method's name and the number; ``--new-version`` writes and counts on."""
+def test_changed_numbers_are_written_only_as_a_new_version(name, change, message, method_files):
+    """Exit status 1 with the method's name and the number; ``--new-version`` writes the next version."""
     path = method_files / f"{name}.json"
     content = json.loads(path.read_text())
     change(content["episodes"][0])
@@ -168,7 +168,7 @@ def test_numbers_that_moved_are_written_only_as_a_new_version(name, change, mess
 
 
 def test_numbers_within_tolerance_stay_to_the_last_bit(method_files):
-    """A new score is added; ``--new-version`` makes no new version."""
+    """A new score is added; ``--new-version`` does not change the version."""
     path = method_files / "homogeneous.json"
     content = json.loads(path.read_text())
     scores = content["episodes"][0]["scores"]
@@ -184,7 +184,7 @@ def test_numbers_within_tolerance_stay_to_the_last_bit(method_files):
 
 
 def test_a_new_method_gets_the_episodes_of_another(method_files):
-    """Of the first file that it can play."""
+    """A new method has the episodes of the first file with compatible environments."""
     old = method_files / "homogeneous.json"
     content = old.read_text()
     old.rename(method_files / "persistence.json")

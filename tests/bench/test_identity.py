@@ -1,4 +1,4 @@
-"""What a stored result is recognised by: an episode of another world is none of this one's."""
+"""Identity of a stored result: an episode of another configuration has another identity."""
 
 import json
 import subprocess
@@ -47,13 +47,13 @@ for _ in range(2):
 
 @pytest.fixture(autouse=True)
 def apart(run_cache, monkeypatch):
-    """What a test registers is forgotten after it."""
+    """Remove registrations of a test after it."""
     monkeypatch.setenv(CACHE_VARIABLE, run_cache)
     register_apart(monkeypatch)
 
 
-def test_an_edited_world_of_a_script_is_played_again(tmp_path):
-    """Under the same id: another instrument, prior or question is another episode; the same again is none."""
+def test_an_edited_world_of_a_script_is_run_again(tmp_path):
+    """Another instrument, prior or task under the same id gives another identity; an equal configuration does not."""
     log = tmp_path / "log"
     path = write_baseline(tmp_path, init=counting(log))
     register(TINY, ID)
@@ -68,8 +68,8 @@ def test_an_edited_world_of_a_script_is_played_again(tmp_path):
         assert count(log) == n
 
 
-def test_another_question_is_another_identity(tmp_path):
-    """Of another board, world, seed or method's file; a world is recognised by its numbers."""
+def test_another_task_has_another_identity(tmp_path):
+    """Another subtrack, world, seed or method's file gives another identity; a world is identified by its numbers."""
     path, other = write_baseline(tmp_path), write_baseline(tmp_path, "other", doc="Other.")
     jobs = [Job(FILTER, path, 1), Job(FIXED_LAG, path, 1), Job(Environment(FILTER.id), path, 1), Job(FILTER, path, 2),
             Job(FILTER, other, 1)]
@@ -84,8 +84,8 @@ def injection_identity(name="random_pair", **given):
 
 
 def test_a_changed_default_is_another_identity(monkeypatch):
-    """Of the arguments of scored runs, of the registration, of the environment's class, and of the version of scoring:
-    stored results of before are not reused. What is given as it is by default changes nothing."""
+    """The identity depends on the arguments of scored runs, of the registration, of the environment's class, and on the
+    version of scoring: earlier results are not reused. An explicit argument equal to the default does not change it."""
     before = injection_identity()
     assert injection_identity(estimator="full", gate=None) == before != injection_identity(estimator="reduced")
 
@@ -105,7 +105,7 @@ def test_a_changed_default_is_another_identity(monkeypatch):
 
 
 def test_files_and_loader_of_a_method_are_in_its_identity(tmp_path, monkeypatch):
-    """Its own file, the configuration beside a model, and the function that loads it."""
+    """The identity depends on the file, the configuration of a model, and the function that loads it."""
     model = tmp_path / "model.zip"
     found = set()
     for content, config in ((b"a", "{}"), (b"b", "{}"), (b"b", '{"algo": "ppo"}')):
@@ -117,8 +117,8 @@ def test_files_and_loader_of_a_method_are_in_its_identity(tmp_path, monkeypatch)
     assert len(found) == 4
 
 
-def test_a_script_with_a_part_of_its_own_resumes(tmp_path):
-    """Its workers do not know the file in which the part is written; what they played counts all the same."""
+def test_a_script_with_a_custom_component_resumes(tmp_path):
+    """Workers do not have the file that defines the component; their results are reused nevertheless."""
     log = tmp_path / "log"
     path = write_baseline(tmp_path, init=counting(log))
     script = tmp_path / "script.py"

@@ -1,4 +1,4 @@
-"""Third-party methods in a separate process: the same scores, and no way out under bubblewrap."""
+"""Third-party methods in a separate process: the same scores, and no access to the outside under bubblewrap."""
 
 import gc
 import io
@@ -61,7 +61,7 @@ class Policy:
 
 @pytest.fixture(autouse=True)
 def cache(run_cache, monkeypatch):
-    """One cache for all tests of this session, and no worker left."""
+    """Use one cache for all tests of this session, and close all workers."""
     monkeypatch.setenv(CACHE_VARIABLE, run_cache)
     yield
     isolation.close()
@@ -78,7 +78,7 @@ def worker(path, kind="bubblewrap", **how):
 
 
 def ask(path, kind="bubblewrap", *, reply_timeout=60.0, **how):
-    """Run the file for some steps; returns what it raised."""
+    """Run the file for some steps; return the exception."""
     with worker(path, kind, **how) as there:
         there.begin()
         there.reply_timeout = reply_timeout
@@ -88,21 +88,21 @@ def ask(path, kind="bubblewrap", *, reply_timeout=60.0, **how):
 
 
 def lasting(result):
-    """A result without clocks and memory."""
+    """Return a result without times and memory."""
     scores = {name: value for name, value in result.get("scores", {}).items() if name != "seconds_per_step"}
     return {key: value for key, value in result.items() if key not in ("finished", "seconds", "peak_memory")} | {
         "scores": scores}
 
 
-# -- the same numbers ---------------------------------------------------------------------------
+# -- same scores --------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("environment", [FILTER, FIXED_LAG, SMOOTHING, INJECTION],
                          ids=["filter", "fixed-lag", "smoothing", "injection"])
 def test_scores_are_identical(environment, kind, tmp_path):
-    """An estimator that reports every field, a policy that depends on its random numbers; one worker runs both
-    episodes, and is the only process that executes the file."""
+    """Test an estimator that reports every field, and a policy that depends on its random numbers; one worker runs both
+    episodes, and only its process executes the file."""
     path = write_policy(tmp_path) if environment is INJECTION else write_baseline(
         tmp_path, parameters="{'a': [1, 2.5]}", update="self.level = self.level + voltages.sum() + 0.1 * self.calls; "
         "return Estimate(self.level, self.level**2, voltages, np.eye(4) + np.outer(voltages, voltages)) "
@@ -117,13 +117,13 @@ def test_scores_are_identical(environment, kind, tmp_path):
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_built_in_methods_run_there_too(kind):
-    """By name, as `submit --official --isolate bubblewrap` asks."""
+    """Methods are given by name, as for `submit --official --isolate bubblewrap`."""
     here, there = (run_episode(Job(FILTER, "homogeneous", 1, each))[0] for each in ("none", kind))
     assert here["status"] == "ok" and lasting(here) == lasting(there)
 
 
-def test_seeds_stay_with_the_host(tmp_path):
-    """A policy's generator depends on the episode, but its state does not tell the seed."""
+def test_seeds_are_not_sent_to_workers(tmp_path):
+    """A policy's generator depends on the episode, but its state does not reveal the seed."""
     path = write_policy(tmp_path, "raise RuntimeError(f'{self.random.bit_generator.state} "
                                   "{self.random.integers(2**63)}')")
     said = [run_episode(Job(INJECTION, path, seed, "process"))[0]["message"].split() for seed in (1, 2)]
@@ -131,8 +131,8 @@ def test_seeds_stay_with_the_host(tmp_path):
     assert min(map(int, re.findall(r"\d{10,}", " ".join(said[0])))) > 2**31
 
 
-def test_nothing_of_the_file_runs_in_the_host(tmp_path):
-    """Not even to read its title: neither in this process nor in a worker of joblib."""
+def test_the_file_is_not_executed_in_the_parent_process(tmp_path):
+    """The file is not executed to read its title, neither in this process nor in a worker of joblib."""
     trap = tmp_path / "trap"
     path = write_baseline(tmp_path)
     Path(path).write_text(f"{Path(path).read_text()}\nopen({str(trap)!r}, 'a').write(f'{{os.getppid()}} ')\n")
@@ -144,10 +144,10 @@ def test_nothing_of_the_file_runs_in_the_host(tmp_path):
     assert all(episode["peak_memory"] > 50e6 for episode in record["episodes"])
     before = trap.read_text()
     Job(FILTER, path, 1).load()
-    assert trap.read_text() != before                     # executed here, it is noticed
+    assert trap.read_text() != before                     # execution in this process would be detected
 
 
-# -- which isolation ----------------------------------------------------------------------------
+# -- choice of isolation ------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(("method", "isolate", "strict", "expected"), [
@@ -156,12 +156,12 @@ def test_nothing_of_the_file_runs_in_the_host(tmp_path):
     ("mine.py", "auto", False, "process"), ("mine.py", "none", False, "none"), ("mine.py", "process", True, "process"),
 ])
 def test_isolation_depends_on_method_and_option(method, isolate, strict, expected):
-    """Built-in files run here by default, third-party files never do where that is strict."""
+    """Built-in files run in this process by default, third-party files never if that is strict."""
     assert choose_isolation(FILTER, method, isolate, strict=strict) == expected
 
 
 def test_third_party_files_need_bubblewrap_where_strict(monkeypatch):
-    """The message says why it is missing and how to install it."""
+    """The message explains why it is missing and how to install it."""
     monkeypatch.setattr(isolation, "bubblewrap_problem", lambda: "bubblewrap is not installed")
     for asked in ({"strict": True}, {"isolate": "bubblewrap"}):
         with pytest.raises(ValueError, match=r"is not installed; install bubblewrap \(apt-get install bubblewrap\), "
@@ -174,7 +174,7 @@ def test_third_party_files_need_bubblewrap_where_strict(monkeypatch):
 
 
 def test_a_kernel_that_forbids_namespaces_is_recognised(monkeypatch, tmp_path):
-    """One probe, whose answer is the reason."""
+    """One probe returns the reason."""
     program = tmp_path / "bwrap"
     program.write_text("#!/bin/sh\necho 'bwrap: setting up uid map: Permission denied' >&2\nexit 1\n")
     program.chmod(0o755)
@@ -221,7 +221,7 @@ NEEDS_ROOT = {"password hashes", "another root"}
 
 @pytest.fixture(scope="module")
 def reached(tmp_path_factory):
-    """What the attempts reach in this process, and under bubblewrap."""
+    """Results of the attacks in this process, and under bubblewrap."""
     folder = tmp_path_factory.mktemp("secret")
     truth = simulate(PIPE_2D.with_changes(SCENARIO), 3, progress=False).concentration
     here = {"truth": truth, "a container, which the collector lists": []}
@@ -255,8 +255,8 @@ def reached(tmp_path_factory):
 
 @confined
 @pytest.mark.parametrize("what", ATTEMPTS)
-def test_it_does_not_reach(what, reached):
-    """The same code reaches it without bubblewrap, where that does not need root."""
+def test_attacks_fail(what, reached):
+    """Without bubblewrap the same code succeeds, unless it requires root."""
     here, there = reached
     assert what in here or (what in NEEDS_ROOT and os.getuid())
     assert repr(what) not in there
@@ -290,8 +290,8 @@ FORK = """
     ("os.close(4); __import__('time').sleep(60)", "ended with status|no reply within 3 s", False),
     ("return Estimate(np.array([object()]))", "numeric in arrays", True),
 ])
-def test_what_goes_wrong_is_reported(statement, message, lives, tmp_path):
-    """Exceptions, memory, crashes, silence, and messages that are malformed or too long."""
+def test_failures_are_reported(statement, message, lives, tmp_path):
+    """Exceptions, memory, crashes, missing replies, and messages that are malformed or too long are reported."""
     path = write_baseline(tmp_path, update=statement)
     said, is_alive = ask(path, KIND, reply_timeout=3.0, limits=Limits(memory=3 << 30))
     assert re.search(message, said) and is_alive == lives
@@ -303,14 +303,14 @@ def test_what_goes_wrong_is_reported(statement, message, lives, tmp_path):
     ("kept = np.ones(2**25)", Limits(memory=3 << 30), "ResourceLimitError: it held more than 3072 MiB|MemoryError"),
 ], ids=["processes", "memory of all processes"])
 def test_limits_hold_for_all_its_processes(child, limits, message, tmp_path):
-    """Processes are also counted from outside, since the kernel does not count those of root."""
+    """Processes are also counted by the parent, because the kernel does not count processes of root."""
     said, _ = ask(write_baseline(tmp_path, update=FORK.format(child=child)), limits=limits)
     assert re.search(message, said)
 
 
 @confined
 def test_disk_space_is_limited(tmp_path):
-    """Its only writable folder lies in memory and has a size."""
+    """The only writable folder is in memory and has a limited size."""
     write = ("content = bytes(2**20)\n        for k in range(200):\n"
              "            open(f'{Path.home()}/{k}', 'wb').write(content)\n        raise RuntimeError('wrote all')")
     said, _ = ask(write_baseline(tmp_path, update=write), limits=Limits(disk=100 << 20))
@@ -330,8 +330,8 @@ STUBBORN = """
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_worker_ends_with_its_host(kind, tmp_path):
-    """Killed or not; under bubblewrap its children, which have left their session, end too."""
+def test_a_worker_ends_with_its_parent(kind, tmp_path):
+    """The worker ends even if its parent is killed; under bubblewrap its children in other sessions end too."""
     path = write_baseline(tmp_path, update=STUBBORN if kind == "bubblewrap" else "while True: pass")
     program = ("import numpy as np; from eitbench.bench.isolation import Worker\n"
                f"there = Worker('estimation', {FILTER.id!r}, {json.loads(FILTER.kwargs)!r}, {path!r}, {kind!r})\n"
@@ -349,14 +349,14 @@ def test_a_worker_ends_with_its_host(kind, tmp_path):
 
 
 def is_running(pid):
-    """Whether there is such a process, other than one that has ended and was not waited for."""
+    """Return whether the process exists and has not ended as a zombie."""
     with suppress(OSError):
         return "State:\tZ" not in Path(f"/proc/{pid}/status").read_text()
     return False
 
 
-def test_a_question_that_is_not_read_times_out(tmp_path):
-    """A worker may answer in advance and read nothing until the pipe is full."""
+def test_an_unread_request_times_out(tmp_path):
+    """A worker may reply in advance without reading, until the pipe is full."""
     ahead = ("from eitbench.bench.isolation import encode_message\n        os.write(4, encode_message({}))\n"
              "        while True: os.write(4, encode_message({'estimate': None}))")
     with worker(write_baseline(tmp_path, init=ahead), "process") as there:
@@ -368,20 +368,20 @@ def test_a_question_that_is_not_read_times_out(tmp_path):
         assert not there.is_alive
 
 
-def test_secrets_must_lie_elsewhere_than_python():
-    """Neither a cache with truths nor a maintainer's secret where workers read."""
+def test_secrets_must_be_outside_readable_folders():
+    """The cache and a maintainer's secret must be outside the folders that workers can read."""
     place = next(place for place in readable_paths() if place.is_dir() and "packages" in place.name)
     with pytest.raises(ValueError, match=r"the cache folder .* must lie outside .*, which isolated methods can read"):
         check_out_of_reach(place / "cache", "the cache folder")
     check_out_of_reach(ROOT / "leaderboards" / "held_out.json", "a record")
 
 
-# -- failures are the episode's -----------------------------------------------------------------
+# -- failures of episodes -----------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("statement", ["raise KeyError('oh')", "os._exit(3)"])
 def test_the_next_episode_begins_with_a_worker_that_answers(statement, tmp_path):
-    """The result of a failed episode names the user's line, also from another process."""
+    """The result of a failed episode has the line of the user's file, also from another process."""
     path = write_baseline(tmp_path, update=f"if self.task and voltages[0] != 0.0: {statement}")
     job = Job(FILTER, path, 1, "process")
     result, fields = run_episode(job)
@@ -394,7 +394,7 @@ def test_the_next_episode_begins_with_a_worker_that_answers(statement, tmp_path)
 
 
 def test_a_changed_file_does_not_run(tmp_path):
-    """A record is of one file; a new worker would run another."""
+    """A record is of one file; a new worker must not run another."""
     path = write_baseline(tmp_path)
     loaded = Job(FILTER, path, 1, "process").load()
     isolation.close()
@@ -408,7 +408,7 @@ from eitbench.bench.isolation import encode_message
 valid = {{"title": "Mine", "boards": ["filter"], "role": None, "parameters": {{}}, "suits": True}}
 os.write(4, encode_message(valid | {{{}}}))
 """
-"""A file that replies in the place of its process before it is loaded."""
+"""A file that sends a reply in place of its process before it is loaded."""
 
 
 @pytest.mark.parametrize(("content", "message"), [
@@ -422,7 +422,7 @@ os.write(4, encode_message(valid | {{{}}}))
     (ABOUT.format("'privileged': True"), "is privileged"),
 ])
 def test_files_that_cannot_be_loaded_are_named(content, message, tmp_path):
-    """A ``ValueError`` with the path, also if the file makes the process lie."""
+    """A ``ValueError`` has the path, also if the file makes the process send a forged reply."""
     path = tmp_path / "mine.py"
     path.write_text(content)
     with pytest.raises(ValueError, match=message) as caught:
@@ -431,17 +431,17 @@ def test_files_that_cannot_be_loaded_are_named(content, message, tmp_path):
 
 
 def test_a_worker_does_not_choose_its_name(tmp_path):
-    """Results are stored under it: those of a file must not replace those of a built-in method."""
+    """Results are stored under the name: results of a file must not replace results of a built-in method."""
     path = Path(write_baseline(tmp_path))
     path.write_text(path.read_text() + "\nimport eitbench.bench.methods as b\nmade = b.Method\n"
                     "b.Method = lambda track, name, *rest: made(track, 'homogeneous', *rest)\n")
     assert Job(FILTER, str(path), 1, "process").load().name == "mine"
-    with pytest.raises(ValueError, match="has the name of one of ours"):
+    with pytest.raises(ValueError, match="has the name of a built-in method"):
         Job(FILTER, write_baseline(tmp_path, "homogeneous"), 1, "process").load()
 
 
-def test_output_is_marked_cleaned_and_limited(tmp_path, capsys):
-    """Standard error shows the method's lines; nothing in them moves the cursor."""
+def test_output_is_prefixed_sanitised_and_limited(tmp_path, capsys):
+    """Standard error shows the method's lines without control characters."""
     path = write_baseline(tmp_path, init="print('made\\x1b[2J'); print('x' * 20_000)")
     with worker(path, "process") as there:
         there.begin()
@@ -450,7 +450,7 @@ def test_output_is_marked_cleaned_and_limited(tmp_path, capsys):
 
 
 def test_an_episode_has_a_time_limit(tmp_path, monkeypatch):
-    """One reply after the other just in time could take days."""
+    """The limit holds for the sum of the replies, each within its own limit."""
     with worker(write_baseline(tmp_path, update="__import__('time').sleep(0.2)"), "process") as there:
         monkeypatch.setattr(isolation, "EPISODE_TIMEOUT_S", 0.5)
         there.begin()
@@ -467,7 +467,7 @@ numbers = hnp.arrays(st.sampled_from([np.float64, np.float32, np.int64, np.bool_
 
 @given(st.dictionaries(st.text(), st.integers() | st.text() | st.none()), st.dictionaries(st.text(), numbers))
 def test_messages_arrive(header, arrays):
-    """Headers and arrays of all shapes."""
+    """Headers and arrays of all shapes are decoded unchanged."""
     said, there = decode_message(io.BytesIO(encode_message(header, arrays)).read)
     assert said == header and set(there) == set(arrays)
     for name, array in arrays.items():
@@ -486,14 +486,14 @@ def test_messages_arrive(header, arrays):
     (b'[{}, [["a", "<f8", ' + b"[1" + b", 1" * 80 + b"]]]]", b"\0" * 8),
 ])
 def test_malformed_messages_are_rejected(head, body):
-    """Objects above all, and whatever numpy would parse as a program."""
+    """Objects and all other dtypes that numpy would parse are rejected."""
     content = io.BytesIO(len(head).to_bytes(8, "little") + len(body).to_bytes(8, "little") + head + body)
     with pytest.raises(ValueError, match="message must"):
         decode_message(content.read)
 
 
 def test_a_run_leaves_no_worker(tmp_path, monkeypatch):
-    """One worker for all episodes of a method, and none at the end."""
+    """One worker runs all episodes of a method, and ends with the run."""
     made = []
 
     class Counted(Worker):
@@ -510,7 +510,7 @@ def test_a_run_leaves_no_worker(tmp_path, monkeypatch):
 
 
 def test_long_messages_are_not_read():
-    """Their lengths come first."""
+    """Lengths are checked first."""
     asked = []
 
     def read(n):

@@ -1,4 +1,4 @@
-"""What is learned is what is played: numpy's network is torch's, and it plays what it was trained for alone."""
+"""Trained networks: the numpy implementation agrees with torch, and networks run on their training task only."""
 
 import importlib
 from dataclasses import replace
@@ -22,7 +22,7 @@ LEARNED = ("learned_correction", "learned_smoother", "learned_fixed_lag", "learn
 
 @pytest.fixture(scope="module")
 def study():
-    """`studies/learn.py`, which finds what lies beside it as when it is run."""
+    """Import `studies/learn.py` with its folder on the path."""
     with pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(ROOT / "studies")
         return importlib.import_module("learn")
@@ -30,7 +30,7 @@ def study():
 
 @pytest.fixture
 def data():
-    """Three episodes of ten steps, in which a filter is off by a multiple of what is seen."""
+    """Three episodes of ten steps, in which the filter error is a multiple of the inputs."""
     random = torch.Generator().manual_seed(0)
     inputs = torch.randn(3, 10, 7, generator=random)
     truth = 0.3 * inputs[..., :2] - 0.1 * inputs[..., 2:4]
@@ -40,9 +40,9 @@ def data():
 
 
 @pytest.mark.parametrize("both_ways, many", [(False, 1), (True, 1), (False, 4), (True, 4)])
-def test_numpy_answers_as_torch(study, both_ways, many):
-    """Of the same weights, which half precision holds, over an episode: corrections, and their variances at nodes.
-    Of several networks that are joined, it is the mean."""
+def test_numpy_agrees_with_torch(study, both_ways, many):
+    """For equal weights in half precision, corrections and variances at nodes agree over an episode. Several joined
+    networks return the mean."""
     torch.manual_seed(1)
     scales = 0.5 + torch.rand(7), 0.5 + torch.rand(3)
     networks = [study.Correction(*scales, 24, both_ways) for _ in range(many)]
@@ -67,7 +67,7 @@ def test_numpy_answers_as_torch(study, both_ways, many):
     ways = [list(memories(inputs))]
     if both_ways:
         ways.append(list(memories(inputs[::-1], "backward_"))[::-1])
-    tolerance = 1e-6 if many == 1 else 2e-3  # means of biases are rounded once more
+    tolerance = 1e-6 if many == 1 else 2e-3  # means of biases are rounded again
     for t, memory in enumerate(np.concatenate(ways, axis=1)):
         mean, variance = apply_correction(arrays, 2.0, np.ones(3), inputs[t], memory)[:2]
         expected = 2.0 * (1.0 + basis @ (1.0 + (scale * correction)[0, t].numpy()))
@@ -91,7 +91,7 @@ def test_a_seed_repeats_and_something_is_learned(study, data, likelihood):
 
 @pytest.fixture(scope="module")
 def short(study):
-    """A short episode, three modes, and what is kept of it."""
+    """A short episode, three modes, and the data that training stores."""
     examples = eitbench.dataset("eitbench/Pipe2D-v0", "train:0", world=CHANGES)
     (example,) = examples
     random = np.random.default_rng(0)
@@ -104,7 +104,7 @@ def short(study):
 
 
 def test_scores_in_modes_are_scores(study, short):
-    """An estimate in the span of the modes scores as the environment would score it."""
+    """An estimate in the span of the modes has the same score as in the environment."""
     examples, example, basis, level = short
     found = study.features(examples, example, basis)
     said = found["truth"] + 1e-3 * np.random.default_rng(0).normal(size=found["truth"].shape)
@@ -113,8 +113,8 @@ def test_scores_in_modes_are_scores(study, short):
     np.testing.assert_allclose(errors, expected, rtol=1e-6)
 
 
-def test_what_is_thought_later_is_of_the_same_state(study, short, monkeypatch):
-    """At each step the modes are those of the filter's state so many steps before, at the record's end too."""
+def test_lagged_modes_are_of_the_same_state(study, short, monkeypatch):
+    """At each step the modes are of the filter's state ``lag`` steps before, also at the end of the episode."""
     examples, example, basis, level = short
     monkeypatch.setattr(study, "LAGS", (2,))
     found = study.features(examples, example, basis)
@@ -135,22 +135,22 @@ def test_what_is_thought_later_is_of_the_same_state(study, short, monkeypatch):
     np.testing.assert_array_equal(seen["inputs"], np.concatenate([found["inputs"][2:], seen["reduced"]], axis=1))
 
 
-@pytest.mark.parametrize("changes, assumed, plays", [
+@pytest.mark.parametrize("changes, assumed, accepted", [
     ({"schedule": {"scored_steps": 5}, "instrument": {"noise_relative": 0.02}}, {}, True),
     ({}, {"mean_velocity": 4.0}, False),
     (CHANGES, {}, False),
 ])
-def test_it_plays_the_task_that_it_was_trained_for(changes, assumed, plays):
-    """Other records of the same pipe too; no other vessel, and no other model of the flow."""
+def test_networks_are_compatible_with_their_training_task(changes, assumed, accepted):
+    """Episodes of other lengths are accepted; other vessels and flow models are rejected."""
     task = make_task(entry(ID).world.with_changes(changes), **assumed)
-    assert load_method("learned_correction", "estimation").suits(task) == plays
+    assert load_method("learned_correction", "estimation").suits(task) == accepted
 
 
 @pytest.mark.parametrize("id, method", [
     ("eitbench/Pipe2DSmoothing-v0", "learned_smoother"), ("eitbench/Pipe2DFixedLag-v0", "learned_fixed_lag"),
     ("eitbench/Pipe2DObstacle-v0", "learned_obstacle"), ("eitbench/Pipe2D-v0", "learned_voltages")])
-def test_each_is_for_its_own_question(id, method):
-    """Its lag and its vessel; the pipe without an obstacle asks for another network, tanks and known flows for none."""
+def test_networks_are_for_their_lag_and_vessel(id, method):
+    """Networks match a lag and a vessel; the obstacle needs another network, tanks and known flows have none."""
     task = make_task(entry(id).world, **entry(id).settings)
     assert load_method(method, "estimation").suits(task)
     assert not load_method(method, "estimation").suits(make_task(entry("eitbench/StationaryTank2D-v0").world))
@@ -161,7 +161,7 @@ def test_each_is_for_its_own_question(id, method):
 
 @pytest.mark.parametrize("name", LEARNED)
 def test_a_shipped_network_is_small(name):
-    """Plain arrays, two megabytes at most."""
+    """The file has plain arrays, two megabytes at most."""
     method = load_method(name, "estimation")
     path = Path(method.path).parent / method.parameters["network"]
     assert path.stat().st_size < 2e6

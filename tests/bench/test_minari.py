@@ -1,4 +1,4 @@
-"""Injections as a Minari data set: what it holds is what the environment shows and pays."""
+"""Injection episodes as a Minari data set, with the observations and rewards of the environment."""
 
 import gymnasium as gym
 import numpy as np
@@ -22,7 +22,7 @@ def _short(monkeypatch, tmp_path):
 
 
 def test_replaying_gives_the_same_again():
-    """By the seed in an episode's metadata and its actions, in the environment that the data set recovers."""
+    """The seed in an episode's metadata and the actions reproduce the episode in the recovered environment."""
     assert export_minari(NAME, ENV, "random_pair", "train:0-2") == 3
     dataset = minari.load_dataset(NAME)
     env = dataset.recover_environment()
@@ -41,8 +41,8 @@ def test_replaying_gives_the_same_again():
     assert [each["seed"] for each in told] == [0, 1, 2] and len(actions) > 2
 
 
-def test_its_policy_is_the_one_that_is_scored():
-    """The same draws: injections are those of `eitbench run`."""
+def test_the_policy_has_the_same_random_stream_as_in_runs():
+    """The random stream is the same: injections equal those in `eitbench run`."""
     from eitbench.bench.methods import load_method
     from eitbench.bench.runner import iter_injections
     export_minari(NAME, ENV, "random_pair", "dev:3")
@@ -55,7 +55,7 @@ def test_its_policy_is_the_one_that_is_scored():
 
 @pytest.mark.parametrize(("given", "said"), [
     ({"name": "a b"}, "out must be the name of a Minari data set"),
-    ({"env": "eitbench/Pipe2D-v0"}, "does not ask for injections"),
+    ({"env": "eitbench/Pipe2D-v0"}, "is not of the track injection"),
     ({"policy": "nobody"}, "nobody"),
     ({"seeds": "200003"}, "must name the split of test episodes"),
 ])
@@ -65,7 +65,7 @@ def test_mistakes(given, said, tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-def test_command_and_a_name_that_is_taken():
+def test_command_and_existing_name():
     line = ["export", "--format", "minari", "--env", ENV, "--seeds", "train:0", "--out", NAME, "-j", "1"]
     told = CliRunner().invoke(app, line)
     assert told.exit_code != 0 and "policy must be given with format minari" in told.output

@@ -1,4 +1,4 @@
-"""Injection policies: what they believe, that they play, and what becomes of their mistakes."""
+"""Injection policies: belief, rollouts and error messages."""
 
 import json
 
@@ -25,7 +25,7 @@ NAME, INFLOW = "eitbench/Pipe2DInjection-v0", "eitbench/Pipe2DInjectionInflow-v0
 CURRENTS, FAULTS, BUDGET = (f"eitbench/Pipe2DInjection{kind}-v0" for kind in ("Currents", "Faults", "Budget"))
 FLOW = "eitbench/Pipe2DInjectionFlow-v0"
 SHORT = {"world": {"flow": {"mean_velocity": 16.0}, "schedule": {"scored_steps": 4}}}
-"""Sixteen electrodes and a short record."""
+"""Sixteen electrodes and a short episode."""
 KWARGS = {NAME: SHORT, INFLOW: SHORT, CURRENTS: SHORT, FAULTS: SHORT,
           BUDGET: merged(SHORT, {"world": {"schedule": {"budget": 3}}}),
           FLOW: {"world": merged(SHORT["world"], {"flow": {"velocity_range": [15.0, 17.0]}})},
@@ -39,7 +39,7 @@ def environment(name: str) -> InjectionEnv:
 
 
 def actions_of(name: str, policy: str, monkeypatch) -> list[np.ndarray]:
-    """Everything that was injected in an episode."""
+    """Return all currents that were injected in an episode."""
     env, taken, step = environment(name), [], InjectionEnv.step
     with monkeypatch.context() as patch:
         patch.setattr(InjectionEnv, "step", lambda self, action: taken.append(np.array(action)) or step(self, action))
@@ -53,19 +53,19 @@ def actions_of(name: str, policy: str, monkeypatch) -> list[np.ndarray]:
 
 
 def write_policy(folder, body: str = "def act(self, observation): return 7", name: str = "mine") -> str:
-    """The path of a policy file whose class has this body."""
+    """Return the path of a policy file whose class has this body."""
     path = folder / f"{name}.py"
     path.write_text('"""Mine: always the same."""\nclass Policy:\n'
                     f"    def __init__(self, rules, random): pass\n    {body}\n")
     return str(path)
 
 
-# -- what a policy may believe ----------------------------------------------------------------------------------------
+# -- belief -----------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("name", [NAME, INFLOW, FAULTS, BUDGET, FLOW])
 def test_belief_is_the_filter_inside(name):
-    """Followed from outside, the reduced filter is that of the environment, to the bit."""
+    """A belief that a policy updates equals the environment's reduced filter, to the bit."""
     env = environment(name)
     observation, _ = env.reset(seed=SEED)
     belief = Belief(env.rules, observation)
@@ -76,15 +76,15 @@ def test_belief_is_the_filter_inside(name):
         inside = filter_of(env)
         np.testing.assert_array_equal(belief.mean, inside.means()[0])
         np.testing.assert_array_equal(filter_of(belief).covariance, inside.covariance)
-        if name == NAME:                         # what it foretells: nothing was left out
+        if name == NAME:                         # the predicted covariance: no measurement was rejected
             expected = inside.covariance
             np.testing.assert_allclose(belief.posterior_covariance(predicted, pair), expected,
                                        atol=2e-5 * np.abs(expected).max())
             assert belief.design_criteria(predicted)[0][pair] == pytest.approx((predicted - expected).trace(), rel=1e-3)
 
 
-def test_unsound_electrodes_teach_nothing():
-    """Pairs with one of them gain nothing, the others less than with all readings, but more than nothing."""
+def test_faulty_electrodes_have_no_design_criterion():
+    """Pairs with a faulty electrode have criterion 0, others less than with all measurements, but more than 0."""
     env = environment(NAME)
     belief = Belief(env.rules, env.reset(seed=SEED)[0])
     predicted, sound = belief.predict_covariance(), np.arange(16) != 3
@@ -96,8 +96,8 @@ def test_unsound_electrodes_teach_nothing():
     assert (belief.posterior_covariance(predicted, int(np.flatnonzero(touched)[0]), sound) == predicted).all()
 
 
-def test_doubt_is_forgiven_to_those_who_rest():
-    """A failed injection casts doubt on both electrodes; it fades at rest, but for whoever reads interference."""
+def test_fault_scores_decay():
+    """Failed injections raise both electrodes' scores, which decay without injections unless measurements misfit."""
     env = environment(FAULTS)
     observation, _ = env.reset(seed=SEED)
     belief, currents, doubt = Belief(env.rules, observation), np.zeros((2, 16)), np.zeros((2, 16))
@@ -105,7 +105,7 @@ def test_doubt_is_forgiven_to_those_who_rest():
     currents[0, [2, 9]], currents[1, [0, 15]], doubt[1, [2, 9]] = (1.0, -1.0), (1.0, -1.0), 0.36
     belief.update(observation | {"currents": currents[0], "doubt": doubt})
     assert np.flatnonzero(~belief.healthy_electrodes).tolist() == [2, 9]
-    doubt[0, 9] = 0.2                            # whoever rests is doubted as driver by the environment for ever
+    doubt[0, 9] = 0.2                            # the environment keeps the fault score of unused drivers
     belief.update(observation | {"currents": currents[1], "doubt": doubt})
     assert np.flatnonzero(~belief.healthy_electrodes).tolist() == [9]
     np.testing.assert_allclose(belief.fault_score[[2, 9]], [0.8 * 0.36, 0.8 * 0.36 + 0.2])
@@ -113,7 +113,7 @@ def test_doubt_is_forgiven_to_those_who_rest():
 
 
 def test_look_ahead_finds_the_best_plan():
-    """With a beam that holds every pair, depth 2 is the minimum over all plans; depth 1 is greedy."""
+    """Depth 2 with a beam of all pairs is the minimum over all plans; depth 1 is greedy."""
     env = environment(NAME)
     belief, sound = Belief(env.rules, env.reset(seed=SEED)[0]), np.arange(16) % 3 != 0
     predicted = belief.predict_covariance()
@@ -125,8 +125,8 @@ def test_look_ahead_finds_the_best_plan():
     assert belief.look_ahead(2, len(gains), sound) == np.argmin(costs)
 
 
-def test_beforehand_is_the_expected_liquid():
-    """A belief without data is linear about the expected level, and at the level both derivatives agree."""
+def test_the_prior_belief_is_the_expected_concentration():
+    """A belief without data is linear about the expected concentration, at which both derivatives agree."""
     env = environment(NAME)
     belief = Belief.from_prior(env.rules)
     assert filter_of(belief).concentration[0] == pytest.approx(env.world.expected_concentration, rel=1e-12)
@@ -141,7 +141,7 @@ def test_beforehand_is_the_expected_liquid():
 
 @pytest.mark.parametrize("name", list(KWARGS))
 def test_the_action_of_a_pair_injects_it(name):
-    """In every world the pair's currents flow, and nothing flows where nothing is asked for."""
+    """A pair's action injects its currents in every world; the action without injection has no current."""
     rules = environment(name).rules
     action = rules.action(21)
     assert rules.action_space.contains(np.int64(action) if rules.limit is None else action)
@@ -157,7 +157,7 @@ def test_the_action_of_a_pair_injects_it(name):
 
 @pytest.mark.parametrize("budget", [0, 1, 7, 30, 182, 500])
 def test_an_even_budget_is_spent_exactly(budget):
-    """So many injections, or one at each step; between two of them the same number of steps, give or take one."""
+    """Intervals differ by one step at most; a budget above the number of steps injects in each step."""
     rules = Rules(PIPE_2D.with_changes({"schedule": {"scored_steps": 180, "budget": budget}}))
     steps = rules.world.n_steps - 16
     when = np.flatnonzero([rules.is_injection_step(np.array([left, 0.0])) for left in range(steps, 0, -1)])
@@ -165,13 +165,13 @@ def test_an_even_budget_is_spent_exactly(budget):
     assert len(when) < 2 or np.ptp(np.diff([-1, *when])) <= 1
 
 
-# -- playing ----------------------------------------------------------------------------------------------------------
+# -- rollouts ---------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("name", list(KWARGS))
 @pytest.mark.parametrize("policy", builtin_methods("injection"))
-def test_policies_play_what_they_suit(policy, name, monkeypatch):
-    """Valid actions, reproducible to the bit, within the budget; what does not suit is refused."""
+def test_policies_run_in_compatible_environments(policy, name, monkeypatch):
+    """Actions are valid, reproducible to the bit, and within the budget; incompatible environments are rejected."""
     env = environment(name)
     if not load_method(policy, "injection").suits(env.rules):
         with pytest.raises(ValueError, match=f"policy {policy} does not suit {name}"):
@@ -183,8 +183,8 @@ def test_policies_play_what_they_suit(policy, name, monkeypatch):
     assert all(env.action_space.contains(action.astype(dtype)) for action in taken)
 
 
-def test_scores_are_those_of_the_exact_filter():
-    """The mean error under the full estimator is that of its own estimates, step by step."""
+def test_scores_are_computed_with_the_exact_filter():
+    """The mean error with the full estimator equals the mean error of its estimates, step by step."""
     played = injected(NAME, SHORT, "best_pair", SEED)
     env = runner.cached_environment(Environment(NAME, json.dumps(SHORT | {"estimator": "full"})))
     env.reset(seed=SEED)
@@ -201,8 +201,8 @@ def jobs_of(policies: list[str], seeds: str, **kwargs) -> list[Job]:
             for policy in policies for seed in parse_seeds(seeds)]
 
 
-def test_played_episodes_are_kept(tmp_path, monkeypatch):
-    """A record of the format that baselines have; what is there is not played again, but for what was cut short."""
+def test_finished_episodes_are_stored(tmp_path, monkeypatch):
+    """The record has the same format as for estimators; stored episodes are not rerun, except interrupted ones."""
     store = EpisodeStore(tmp_path / "new")
     todo = jobs_of(["opposite", "adjacent"], "dev:1,0", estimator="reduced")
     run_jobs(todo, store, command="eitbench run")
@@ -231,7 +231,7 @@ def test_played_episodes_are_kept(tmp_path, monkeypatch):
 
 
 def test_a_mistake_is_the_result_of_its_policy(tmp_path):
-    """An episode that fails is recorded with its reason, and has no row; the privileged and the floor are marked."""
+    """Failed episodes are recorded with the reason, without a row; privileged methods are marked."""
     store = EpisodeStore(tmp_path)
     bad = write_policy(tmp_path, "def act(self, observation): return 0.5", "bad")
     run_jobs(jobs_of([bad, "random_pair"], "dev:0", estimator="reduced"), store)
@@ -242,7 +242,7 @@ def test_a_mistake_is_the_result_of_its_policy(tmp_path):
 
 
 def test_errors_of_policies_are_ordered_and_pool_trainings():
-    """A policy that failed in an episode comes last; agents that differ in their training seed are averaged."""
+    """A policy with a failed episode is last; training seeds of an agent are averaged."""
     errors = {"clairvoyant": [1.0, 2.0, 3.0], "best_pair": [2.0, 3.1, 4.0], "random_pair": [3.0, 4.1, 5.2],
               "bold": [0.5, 1.0], "ppo_seed0": [1.7, 1.8, 1.9], "ppo_seed1": [2.3, 2.4, 2.5]}
     rows = hand_made(**errors)
@@ -253,28 +253,28 @@ def test_errors_of_policies_are_ordered_and_pool_trainings():
     assert gap_text(rows[rows["policy"] != "clairvoyant"]) == ""
 
 
-# -- mistakes ---------------------------------------------------------------------------------------------------------
+# -- errors -----------------------------------------------------------------------------------------------------------
 
 
-def test_wrong_names_are_named(tmp_path):
-    """Of policies, environments and estimators; and a file without a policy."""
+def test_unknown_names_are_reported(tmp_path):
+    """Unknown policies, environments and estimators are reported, and a file without a policy."""
     with pytest.raises(ValueError, match=r"mine\.py: Policy must have a method act\(observation\)"):
         load_method(write_policy(tmp_path, "x = 1"), "injection")
     with pytest.raises(ValueError, match=r"policy must be the path of .*, or one of adjacent, .*; got 'lucky'"):
         load_method("lucky", "injection")
-    with pytest.raises(ValueError, match="has the name of one of ours"):
+    with pytest.raises(ValueError, match="has the name of a built-in method"):
         load_method(write_policy(tmp_path, name="adjacent"), "injection")
     (tmp_path / "greedy_a.zip").write_bytes(b"PK")
-    with pytest.raises(ValueError, match=r"greedy_a\.zip has the name of one of ours"):
+    with pytest.raises(ValueError, match=r"greedy_a\.zip has the name of a built-in method"):
         load_method(str(tmp_path / "greedy_a.zip"), "injection")
-    with pytest.raises(ValueError, match="environment eitbench/Pipe2D-v0 does not ask for injections"):
+    with pytest.raises(ValueError, match="environment eitbench/Pipe2D-v0 is not of the track injection"):
         injected("eitbench/Pipe2D-v0", {}, "adjacent", 1)
     with pytest.raises(ValueError, match="estimator must be one of full, reduced, got 'none'"):
         injected(NAME, SHORT, "adjacent", 1, "none")
 
 
-def test_anybodys_file_plays(tmp_path):
-    """Its title is its docstring's first words; a wrong action is named."""
+def test_a_third_party_file_runs(tmp_path):
+    """Its title is the start of its docstring; an invalid action is reported."""
     loaded = load_method(path := write_policy(tmp_path), "injection")
     assert (loaded.name, loaded.title, loaded.privileged, loaded.parameters) == ("mine", "Mine", False, {})
     played = injected(NAME, SHORT, path, SEED, "reduced")
@@ -295,7 +295,7 @@ def hand_made(**errors: list[float]) -> pd.DataFrame:
 
 
 def test_adaptivity_gap_is_the_formula():
-    """(2 − 1)/(5 − 1) on a table made by hand; the open-loop policy that is better in the mean counts."""
+    """The gap is (2 − 1)/(5 − 1) for a given table; the open-loop policy with the smaller mean is used."""
     table = hand_made(clairvoyant=[1.0, 1.0], random_pair=[4.0, 6.0], a=[1.5, 2.5], b=[1.0, 9.0], spy=[0.0, 0.0])
     gap, low, high = adaptivity_gap(table, ["b", "a"])
     assert gap == 0.25
@@ -305,8 +305,8 @@ def test_adaptivity_gap_is_the_formula():
     assert adaptivity_gap(same, ["a"]) == (0.25, 0.25, 0.25)
 
 
-def test_adaptivity_gap_s_interval_is_student_s():
-    """Of a ratio of means, by its linearisation; the plain percentiles are 8 % narrower at n = 12."""
+def test_the_interval_of_the_adaptivity_gap_is_student_s():
+    """The interval of the ratio of means is linearised; plain percentiles are 8 % narrower at n = 12."""
     random = np.random.default_rng(5)
     best, lot, seer = (level * (1.0 + 0.1 * random.standard_normal(12)) for level in (2.0, 5.0, 1.0))
     gap, low, high = adaptivity_gap(hand_made(clairvoyant=seer, random_pair=lot, a=best), ["a"])
@@ -318,8 +318,8 @@ def test_adaptivity_gap_s_interval_is_student_s():
 
 
 @pytest.mark.parametrize("open_loop", [[], ["c"]])
-def test_a_table_with_gaps_is_refused(open_loop):
-    """Every policy that counts has played every episode."""
+def test_an_incomplete_table_is_rejected(open_loop):
+    """Every policy of the gap must have finished every episode."""
     table = hand_made(clairvoyant=[1.0, 1.0], random_pair=[4.0, 6.0], c=[2.0])
     with pytest.raises(ValueError, match="rows must hold clairvoyant, random_pair and some open-loop policies"):
         adaptivity_gap(table, open_loop)

@@ -1,4 +1,4 @@
-"""What the filter inside claims is scored as estimators' claims are, and old records stay true."""
+"""Uncertainty of the filter inside the environment is scored as for estimators, and old records stay valid."""
 
 import json
 
@@ -22,7 +22,7 @@ CLAIMS = ("nis", "crps", "coverage_50", "coverage_90", "spread_ratio")
 
 
 def again(name: str, currents: np.ndarray) -> dict[str, list]:
-    """What an environment of its own says at each scored step, of the same injections."""
+    """Return the outputs of a separate environment at each scored step, for the same injections."""
     env = make("reduced", name).unwrapped
     env.reset(seed=SEED)
     pairs = env.rules.pairs.tolist()
@@ -44,9 +44,9 @@ def again(name: str, currents: np.ndarray) -> dict[str, list]:
 
 
 @pytest.mark.parametrize("name", [NAME, FAULTS, BUDGET, FLOW])
-def test_claims_are_those_of_the_filter_inside(name):
-    """CRPS, coverage and var/MSE are the formulas' of mean, spread and truth on the truth's nodes
-    within what counts; NIS/m is the mean over the injections of which a reading was used."""
+def test_uncertainty_is_of_the_filter_inside_the_environment(name):
+    """CRPS, coverage and var/MSE equal their formulas for mean, standard deviation and truth at the truth nodes of the
+    scored region; NIS/m is the mean over the injections with accepted measurements."""
     played = runner.run_method(
         Environment(name, json.dumps({"world": world(name), "estimator": "reduced"})),
         load_method("random_pair", "injection"), SEED)
@@ -69,8 +69,8 @@ def test_claims_are_those_of_the_filter_inside(name):
     assert 0.0 < said["crps"] < env.world.expected_concentration
 
 
-def test_only_used_readings_count():
-    """Two readings and then one: (4/1 + 4/4)/2 = 2.5 and 9/1 = 9 have a mean of 5.75."""
+def test_only_accepted_measurements_count():
+    """Two accepted measurements and then one: (4/1 + 4/4)/2 = 2.5 and 9/1 = 9 have the mean 5.75."""
     innovations = ([np.array([2.0, 2.0]), np.array([3.0])], [np.diag([1.0, 4.0]), np.eye(1)])
     outcome = Outcome(entry(NAME).world, 0.0, np.ones(2), innovations=innovations)
     assert compute_scores("injection", outcome)["nis"] == pytest.approx(5.75)
@@ -78,8 +78,8 @@ def test_only_used_readings_count():
     assert [compute_scores("injection", silent)[name] for name in CLAIMS] == [None] * 5
 
 
-def test_a_policy_sees_nothing_of_it():
-    """What is scored is in no observation and no info."""
+def test_policies_do_not_observe_scored_quantities():
+    """Scored quantities are neither in an observation nor in an info."""
     env = make("reduced")
     observation, info = env.reset(seed=SEED)
     known = set(observation)
@@ -88,12 +88,11 @@ def test_a_policy_sees_nothing_of_it():
     assert set(info) == set(later) == {"step"}
 
 
-# -- records of before ---------------------------------------------------------------------------
+# -- earlier records -----------------------------------------------------------------------------
 
 
-def test_a_record_from_before_is_the_same():
-    """Only what a record says is compared: with nothing of it said there is no difference, and a
-    wrong number is one."""
+def test_an_earlier_record_agrees():
+    """Only recorded scores are compared: a missing score is not a difference, and a wrong number is."""
     said = {"status": "ok", "step_errors": [0.1], "scores": {"error": 0.1, "spent": 3}}
     now = said | {"scores": said["scores"] | {"nis": 1.2, "crps": 0.4}}
     assert set(score_differences(said, now)) == {"error", "spent", "step_errors"}

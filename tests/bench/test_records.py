@@ -1,4 +1,4 @@
-"""Records: nothing passes that the schema forbids, nothing that was changed by hand, and what is written comes back."""
+"""Records: files that break the schema or were edited are rejected, and records are read as they were written."""
 
 import hashlib
 import json
@@ -33,7 +33,7 @@ MINE = record("mine", [0.1, 0.25, None], parameters={"alpha": 0.1, "order": [1, 
 
 
 def changed(path, value, whole=MINE):
-    """The record with one field, named as the messages name it, replaced; ``...`` deletes it."""
+    """Return the record with one field, in the notation of the messages, replaced; ``...`` deletes it."""
     copy = json.loads(json.dumps(whole))
     *parts, last = [int(part) if part.isdigit() else part for part in path.split(".")]
     inner = copy
@@ -47,7 +47,7 @@ def changed(path, value, whole=MINE):
 
 
 def write_unchecked(folder, content, name=None):
-    """A file as somebody might leave it."""
+    """Write a file without checks."""
     folder.mkdir(exist_ok=True)
     path = folder / (name or record_file_name(content))
     path.write_text(json.dumps(content))
@@ -58,7 +58,7 @@ def write_unchecked(folder, content, name=None):
 
 
 def test_round_trip(tmp_path):
-    """What was written is read, to the last bit, from a file named by environment, method and version."""
+    """The file that is read equals what was written, to the last bit; environment, method and version name it."""
     assert read_records(tmp_path) == [] and read_records(tmp_path / "none") == []
     path = write_record(tmp_path, MINE)
     assert path.name == f"eitbench-Pipe2D-v0--mine--{sha('mine1')[:8]}.json" and MINE["version"] == sha("mine1")[:8]
@@ -67,11 +67,11 @@ def test_round_trip(tmp_path):
     before = path.read_bytes()
     write_record(tmp_path, dict(reversed(MINE.items())))
     assert path.read_bytes() == before and [file.name for file in tmp_path.iterdir()] == [path.name]
-    assert before.decode().count("\n") < 40                            # a line each for fields, episodes and runs
+    assert before.decode().count("\n") < 40                            # one line for each field, episode and run
 
 
-def test_versions_and_splits_have_files_of_their_own(tmp_path):
-    """Another version of the method, or other seeds, do not replace a record; another run of the library does."""
+def test_versions_and_splits_have_separate_files(tmp_path):
+    """Other versions of the method, or other seeds, do not replace a record; runs with other library versions do."""
     other_code = RUN | {"source": sha("newer")}
     for each in (MINE, record("mine", [0.1], version="2"), record("mine", [0.1], version="v1"),
                  record("mine", {"dev:0": 0.1}), record("mine", [0.3], runs=[other_code])):
@@ -81,7 +81,7 @@ def test_versions_and_splits_have_files_of_their_own(tmp_path):
 
 
 def test_python_objects_are_written_as_json(tmp_path):
-    """Numbers as keys and tuples become what they are on disk before they are hashed, so that the hash holds."""
+    """Numeric keys and tuples are converted to JSON types before they are hashed, so that the hash is valid."""
     odd = MINE | {"parameters": {10: (1, 2), 9: None}}
     assert read_record(write_record(tmp_path, odd))["parameters"] == {"10": [1, 2], "9": None}
     with pytest.raises(ValueError, match="record cannot be written as JSON"):
@@ -90,21 +90,21 @@ def test_python_objects_are_written_as_json(tmp_path):
         write_record(tmp_path, MINE | {"parameters": {"a": {1, 2}}})
 
 
-def test_the_digest_is_what_the_schema_says():
-    """sha256 of the JSON with sorted keys and no spaces, in UTF-8: anybody can compute it."""
+def test_the_digest_is_as_the_schema_defines():
+    """The hash is the sha256 of the JSON with sorted keys and no spaces, in UTF-8."""
     content = {key: value for key, value in MINE.items() if key != "sha256"}
     text = json.dumps(content, sort_keys=True, separators=(",", ":"), ensure_ascii=False)
     assert MINE["sha256"] == hashlib.sha256(text.encode()).hexdigest()
 
 
-# -- what is refused --------------------------------------------------------------------------------------------------
+# -- rejected records -------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(("path", "value", "message"), [
     ("schema", 1, r"\$\.schema: 3 was expected"),
     ("source", sha("code"), "'source' was unexpected"),
     ("version", "1", r'\$\.version: "1" does not match'),
-    ("version", "deadbeef", r"\$\.version: must be v1, v2, … of ours, or begin as method_sha256 does"),
+    ("version", "deadbeef", r"\$\.version: must be v1, v2, … or the first eight digits of method_sha256"),
     ("version", ..., '"version" is a required property'),
     ("title", "Fine |\n| 1 | Forged |", r"\$\.title: "),
     ("title", "a\x1b[2Jb", r"\$\.title: .* is not allowed"),
@@ -137,12 +137,12 @@ def test_the_digest_is_what_the_schema_says():
     ("episodes.2.scores", {"error": 0.1, "seconds_per_step": 0.1}, r"\$\.episodes\[2\]\.scores: "),
     ("episodes.1.finished", "yesterday", r'\$\.episodes\[1\]\.finished: "yesterday" does not match'),
     ("episodes.1.run", 1, r"\$\.episodes\[1\]\.run: there are only 1 runs"),
-    ("episodes.1.seed", "test:0", r"\$\.seeds: must be those of the episodes"),
+    ("episodes.1.seed", "test:0", r"\$\.seeds: must be the seeds of the episodes"),
     ("seeds", ["test:0", "dev:1", "test:2"], r"\$\.seeds: must all be of the split test"),
     ("seeds", ["test:0", "test:0", "test:2"], r'\$\.seeds: \["test:0","test:0","test:2"\] has non-unique elements'),
 ])
 def test_violations_are_named(path, value, message, tmp_path):
-    """Nothing is written, and nothing read, that is not of the format; the message names the file and the field."""
+    """A record that breaks the format is neither written nor read; the message has the file and the field."""
     wrong = changed(path, value)
     with pytest.raises(ValueError, match=message):
         write_record(tmp_path / "new", wrong)
@@ -155,20 +155,20 @@ def test_violations_are_named(path, value, message, tmp_path):
 
 @pytest.mark.parametrize("seed", ["test:999999", "test:007", "200001", "train:100000", "99999999999"])
 def test_seeds_have_one_name(seed, tmp_path):
-    """Those that lie outside their split, or that have another name, are no episode's."""
-    with pytest.raises(ValueError, match=rf"\$\.seeds: '{seed}' names no episode"):
+    """Seeds outside their split, or written in another form, are rejected."""
+    with pytest.raises(ValueError, match=rf"\$\.seeds: '{seed}' is not an episode seed"):
         write_record(tmp_path, record("mine", {seed: 0.1}))
     for fine in ("test:99999", "300000"):
         write_record(tmp_path, record("mine", {fine: 0.1}))
 
 
 @pytest.mark.parametrize("run", [RUN | {"dirty": True}, RUN | {"commit": None, "dirty": None}])
-def test_official_is_what_a_commit_can_repeat(run, tmp_path):
-    """Whoever has changed the code reports for himself."""
+def test_official_records_need_a_clean_commit(run, tmp_path):
+    """Records from modified code cannot be official."""
     for official in (False, True):
         mine = record("mine", [0.1], runs=[run], official=official)
         if official:
-            with pytest.raises(ValueError, match=r"\$\.official: must be false where a run was not of a commit"):
+            with pytest.raises(ValueError, match=r"\$\.official: must be false unless all runs are of a commit"):
                 write_record(tmp_path, mine)
         else:
             write_record(tmp_path, mine)
@@ -178,19 +178,19 @@ def test_official_is_what_a_commit_can_repeat(run, tmp_path):
 @pytest.mark.parametrize(("old", "new"), [("0.25", "0.24"), ("test:1", "test:7"), ("An abacus", "A computer"),
                                           ('"official": false', '"official": true')])
 def test_changes_by_hand_are_caught(old, new, tmp_path):
-    """A better number, another seed, another machine: valid JSON of the format, but not what was written."""
+    """A better number, another seed, another machine: valid JSON of the format, with a wrong hash."""
     path = write_record(tmp_path, MINE)
     text = path.read_text(encoding="utf-8")
     assert old in text
     path.write_text(text.replace(old, new), encoding="utf-8")
     with pytest.raises(ValueError, match=r"mine--\w+\.json was changed since it was written"):
         read_records(tmp_path)
-    path.write_text(json.dumps(json.loads(text)), encoding="utf-8")    # layout is free
+    path.write_text(json.dumps(json.loads(text)), encoding="utf-8")    # layout is arbitrary
     assert read_records(tmp_path) == [MINE]
 
 
-def test_a_file_has_its_content_s_name(tmp_path):
-    """Nobody replaces a record by a file of another name, or has two of one thing."""
+def test_the_content_determines_the_file_name(tmp_path):
+    """A record cannot be replaced by a file of another name, and cannot exist twice."""
     path = write_record(tmp_path, MINE)
     path.rename(tmp_path / path.name.replace("mine", "yours"))
     with pytest.raises(ValueError, match=f"must have the name {record_file_name(MINE)}"):
@@ -201,11 +201,11 @@ def test_a_file_has_its_content_s_name(tmp_path):
 
 
 def test_other_versions_of_an_environment_are_set_aside(tmp_path):
-    """A record of an id that is not registered is left out, and a warning names it; the others are read."""
+    """A record of an unregistered id is skipped with a warning; the others are read."""
     old = record("mine", [0.1], id="eitbench/Pipe2D-v99")
     path = write_record(tmp_path, old)
     write_record(tmp_path, MINE)
-    with pytest.warns(UserWarning, match=r"no environment eitbench/Pipe2D-v99") as caught:
+    with pytest.warns(UserWarning, match=r"unknown environment eitbench/Pipe2D-v99") as caught:
         assert read_records(tmp_path) == [MINE]
     assert str(path) in str(caught[0].message)
     path.unlink()
@@ -214,8 +214,8 @@ def test_other_versions_of_an_environment_are_set_aside(tmp_path):
         read_records(tmp_path)
 
 
-def test_only_the_highest_version_of_a_method_of_ours_is_current():
-    """Each environment and split for itself, by number and not by letters; the code that played has no say."""
+def test_only_the_highest_version_of_a_built_in_method_is_current():
+    """Environments and splits are independent; versions are ordered by number, not by text or commit."""
     v2, v10 = (record("a", [0.1], version=version, finished=when) for version, when in (
         ("v2", "2025-01-02"), ("v10", "2025-01-01")))
     tank = record("a", [0.1], id="eitbench/RotatingTank2D-v0", version="v1")
@@ -224,14 +224,14 @@ def test_only_the_highest_version_of_a_method_of_ours_is_current():
     assert split_outdated([v2, tank, v10, dev, other]) == ([tank, v10, dev, other], [v2])
     assert split_outdated([]) == ([], [])
     both = [record("mine", [0.1], version=version, finished=f"2025-01-0{version}") for version in "12"]
-    assert split_outdated(both) == (both, [])                         # digits of a sha256 do not say which came first
+    assert split_outdated(both) == (both, [])                         # digits of a sha256 have no order
 
 
 # -- the schema -------------------------------------------------------------------------------------------------------
 
 
-def test_the_schema_knows_all_that_there_is():
-    """It is a sound schema itself, and has the boards of the code."""
+def test_the_schema_agrees_with_the_code():
+    """The schema is valid, and has the subtracks of the code."""
     schema = json.loads(schema_text())
     assert jsonschema_rs.meta.is_valid(schema)
     assert schema["$schema"].endswith("2020-12/schema")
@@ -242,13 +242,13 @@ def test_the_schema_knows_all_that_there_is():
 
 
 def test_scores_are_open(tmp_path):
-    """Whoever registers a score may write it: any name of small letters, with a finite number or null."""
+    """Registered scores may have any lower-case name, with a finite number or null."""
     scores = {"error": 0.1, "seconds_per_step": 0.01, "missed_bubbles_2": -3.5, "nis": None}
     mine = record("mine", [0.1], scores={name: scores[name] for name in ("missed_bubbles_2", "nis")})
     assert read_record(write_record(tmp_path, mine))["episodes"][0]["scores"] == scores
 
 
-# -- what no run could have made --------------------------------------------------------------------------------------
+# -- impossible records -----------------------------------------------------------------------------------------------
 
 
 PIPE, LATER, LONG = "eitbench/Pipe2D-v0", "eitbench/Pipe2DFixedLag-v0", "eitbench/Pipe2DSmoothing-v0"
@@ -261,8 +261,8 @@ TOO_LONG = entry(PIPE).world.n_steps - 1
     (LONG, {"lag": None}, "smoothing"), (PIPE, {"lag": "all", "world": {"flow": {}}}, "smoothing"),
     (PIPE, {"lag": 3, "world": {"schedule": {"scored_steps": 1}}}, "fixed-lag smoothing"),
     ("eitbench/Pipe2DInjection-v0", {"gate": 3.0}, "injection")])
-def test_a_board_is_that_of_the_environment(id, kwargs, boards, tmp_path):
-    """Whatever the record calls it."""
+def test_the_environment_determines_the_subtrack(id, kwargs, boards, tmp_path):
+    """A record with another subtrack is rejected."""
     assert subtracks_of(id, kwargs) == tuple(boards.split())
     environment = {"id": id, "name": environment_name(id, kwargs), "kwargs": kwargs}
     for board in BOARDS:
@@ -275,19 +275,19 @@ def test_a_board_is_that_of_the_environment(id, kwargs, boards, tmp_path):
 
 
 @pytest.mark.parametrize(("kwargs", "message"), [
-    ({"scenario": 5}, "scenario is no argument of"), ({"world": 5}, "world must be an object, got int"),
+    ({"scenario": 5}, "scenario is not an argument of"), ({"world": 5}, "world must be an object, got int"),
     ({"world": [1]}, "world must be an object, got list"), ({"assume": "all"}, "assume must be an object, got str"),
     ({"lag": -1}, "lag must be 'all' or an integer"), ({"lag": 1.5}, "lag must be"), ({"lag": True}, "lag must be"),
     ({"lag": "some"}, "lag must be"), ({"lag": {}}, "lag must be")])
-def test_arguments_that_there_are_not(kwargs, message, tmp_path):
-    """No run could have had them."""
+def test_unknown_arguments_are_rejected(kwargs, message, tmp_path):
+    """Records with such arguments are impossible."""
     environment = {"id": PIPE, "name": environment_name(PIPE, kwargs), "kwargs": kwargs}
     with pytest.raises(ValueError, match=rf"\$\.environment\.kwargs: {message}"):
         read_record(write_unchecked(tmp_path, record("mine", [0.1], environment=environment)))
 
 
-def test_the_arguments_are_those_of_the_environments():
-    """And no others."""
+def test_the_arguments_agree_with_the_environments():
+    """The lists of arguments agree."""
     for track, single in (("estimation", EstimationEnv), ("injection", InjectionEnv)):
         assert sorted(ENV_KWARGS[track]) == sorted(set(signature(single).parameters) - {"name", "variant"})
 
@@ -295,8 +295,8 @@ def test_the_arguments_are_those_of_the_environments():
 @pytest.mark.parametrize("text", ["1e999", "-1e999", "NaN", "Infinity", "9" * 400, "9" * 5000, '"\\ud800"',
                                   "[" * MAX_DEPTH + "]" * MAX_DEPTH, "[" * 50_000 + "]" * 50_000])
 @pytest.mark.parametrize("place", ['"parameters": {"a": 7}', '"seconds": 7', '"error": 7'])
-def test_what_json_lacks_is_named_with_the_file(text, place, tmp_path):
-    """Numbers that are not finite, half a character, and lists that are nested too deep, wherever they stand."""
+def test_values_that_json_lacks_are_reported_with_the_file(text, place, tmp_path):
+    """Numbers that are not finite, half a character, and lists that are nested too deeply are rejected everywhere."""
     mine = record("mine", [7], parameters={"a": 7}, episodes=[episode("test:0", 7) | {"seconds": 7}])
     path = write_unchecked(tmp_path, mine)
     content = path.read_text()
@@ -308,13 +308,13 @@ def test_what_json_lacks_is_named_with_the_file(text, place, tmp_path):
 
 @pytest.mark.parametrize("field", ["checkpoint_sha256", "version", "method_sha256"])
 def test_a_pattern_ends_where_the_text_does(field, tmp_path):
-    """Python's $ also stands before a last newline."""
+    """Python's $ also matches before a final newline."""
     made = with_content_hash(MINE | {field: (MINE[field] or "a" * 64) + "\n"})
     with pytest.raises(ValueError, match="is not valid"):
         read_record(write_unchecked(tmp_path, made, "it.json"))
 
 
-def test_a_file_that_is_too_large_or_none_is_not_opened(tmp_path):
+def test_large_and_special_files_are_not_opened(tmp_path):
     """Reading a pipe would never end."""
     path = tmp_path / "it.json"
     makers = [path.touch, path.mkdir] + ([lambda: os.mkfifo(path)] if hasattr(os, "mkfifo") else [])
@@ -328,13 +328,13 @@ def test_a_file_that_is_too_large_or_none_is_not_opened(tmp_path):
 
 
 def places(value, path=()):
-    """Where something stands in a record."""
+    """Yield the paths of all values in a record."""
     inner = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
     return [path, *(place for key, each in inner for place in places(each, (*path, key)))]
 
 
 def test_another_validator_agrees():
-    """Whatever is changed in a record, jsonschema accepts and rejects the same: anybody can check the format."""
+    """For any change of a record, jsonschema accepts and rejects the same, so that other tools can check the format."""
     ours, theirs = (make(json.loads(schema_text())) for make in (
         jsonschema_rs.validator_for, jsonschema.Draft202012Validator))
     others = ["", "x" * 121, "a\x1bb", None, [], {}, 0, 0.5, 2**63, -1.0, 1e51, 5e-324, True, [None], {"a": {}}, ...]
@@ -348,8 +348,8 @@ def test_another_validator_agrees():
     assert valid > 30
 
 
-def test_names_of_files_are_spelt_out_in_messages(tmp_path):
-    """A message never prints the control characters of a file's name."""
+def test_names_of_files_are_sanitised_in_messages(tmp_path):
+    """A message never contains the control characters of a file's name."""
     path = write_unchecked(tmp_path, record("mine", [0.1]), name="a\x1b[31m\u202e.json")
     with pytest.raises(ValueError, match="must have the name") as caught:
         read_record(path)
@@ -357,8 +357,8 @@ def test_names_of_files_are_spelt_out_in_messages(tmp_path):
 
 
 @pytest.mark.parametrize("content", [b"", b"{", b"\xff\xfe", b"[]", b"null", b'{"schema": NaN}'])
-def test_what_is_no_record_is_refused(content, tmp_path):
-    """Unlike a run's own episodes, published records must all be sound."""
+def test_files_that_are_not_records_are_rejected(content, tmp_path):
+    """Unlike a run's episodes, published records must all be valid."""
     (tmp_path / "it.json").write_bytes(content)
     with pytest.raises(ValueError, match=r"record .*it\.json (cannot be read|is not valid)"):
         read_records(tmp_path)

@@ -1,4 +1,4 @@
-"""Running baselines: what estimators are shown, what becomes of their mistakes, and whether the scores are true."""
+"""Runs of estimators: their inputs, their errors, and the correctness of scores."""
 
 import json
 import re
@@ -32,12 +32,12 @@ def store(tmp_path):
 
 
 def scores_of(result):
-    """All that must repeat: scores and step errors, but not the clock."""
+    """Return all reproducible scores and step errors, without times."""
     return {**result["scores"], "seconds_per_step": None, "steps": result["step_errors"]}
 
 
 def baseline_of(update, boards=("filter",)):
-    """An estimator that was never a file; ``update(task, i, voltages, currents)`` says what it thinks."""
+    """Return an estimator class without a file; ``update(task, i, voltages, currents)`` returns its estimate."""
     class Estimator:
         def __init__(self, *arguments):
             (self.task,), self.i = arguments, 0
@@ -49,7 +49,7 @@ def baseline_of(update, boards=("filter",)):
     return Method("estimation", "made_here", "Made here", Path(), "0" * 64, boards, {}, Estimator)
 
 
-# -- mistakes of baselines --------------------------------------------------------------------------------------------
+# -- errors of estimators ---------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(("update", "message"), [
@@ -70,8 +70,8 @@ def baseline_of(update, boards=("filter",)):
     ("return Estimate(self.level, None, voltages, -np.eye(4))", "covariance must be positive definite"),
     ("return Estimate(self.level, None, voltages, np.ones((4, 4)))", "covariance must be positive definite"),
 ])
-def test_a_mistake_is_the_result_of_its_baseline_only(update, message, store, tmp_path):
-    """Whatever a baseline does wrong is recorded with the reason; the run goes on, and others score as ever."""
+def test_an_error_affects_only_its_estimator(update, message, store, tmp_path):
+    """Every error of an estimator is recorded with the reason; the run continues, and other scores do not change."""
     good, bad = write_baseline(tmp_path, "good"), write_baseline(tmp_path, "bad", update=update)
     run_jobs([Job(FILTER, bad, 1), Job(FILTER, good, 1)], store)
     failed, fine = sorted(store.results(), key=lambda result: result["status"])
@@ -80,8 +80,9 @@ def test_a_mistake_is_the_result_of_its_baseline_only(update, message, store, tm
     assert scores_of(fine) == scores_of(run_episode(Job(FILTER, good, 1))[0])
 
 
-def test_nothing_but_the_scored_states_must_be_claimed(tmp_path):
-    """Without a variance in the warm-up the scored states' claims count; with one missing later, none does."""
+def test_only_scored_states_need_a_variance(tmp_path):
+    """Only scored states need a variance: one missing in the warm-up is ignored, one missing later removes all
+    scores."""
     late = "return Estimate(self.level, None if self.calls <= {} else 0 * self.level + 4.0)"
     (claimed, fields), (unclaimed, _) = (
         run_episode(Job(FILTER, write_baseline(tmp_path, update=late.format(first)), 1)) for first in (2, 3))
@@ -94,9 +95,8 @@ def test_nothing_but_the_scored_states_must_be_claimed(tmp_path):
     assert claimed["nis"] is None and unclaimed["error"] == claimed["error"]
 
 
-def test_calibration_cannot_be_bought_by_one_step(tmp_path):
-    """NIS is of every scored measurement: whoever keeps silent about one of them has none, so that
-    1 is not for sale by a single innovation of which one knows that it fits."""
+def test_nis_requires_all_innovations(tmp_path):
+    """NIS requires the innovations of all scored measurements, not of a selection that fits."""
     fits = "Estimate(self.level, None, np.ones(4), np.eye(4))"
     often, once = (run_episode(Job(FILTER, write_baseline(tmp_path, name, update=update), 1))[0]
                    for name, update in (("often", f"return {fits}"),
@@ -106,14 +106,14 @@ def test_calibration_cannot_be_bought_by_one_step(tmp_path):
     assert often["scores"]["error"] == once["scores"]["error"]
 
 
-# -- what estimators are shown ----------------------------------------------------------------------------------------
+# -- inputs of estimators ---------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("environment", [FILTER, SMOOTHING], ids=["filter", "smoothing"])
-def test_estimators_see_the_task_and_measurements_only(environment):
-    """One argument makes it: the task. Two feed it: voltages and currents. No reward, no info, no environment."""
+def test_estimators_receive_the_task_and_measurements_only(environment):
+    """The constructor receives the task, and update voltages and currents; neither receives reward or environment."""
     env, seen = environment.make(), []
-    env.privileged_info = None                                           # is not even called
+    env.privileged_info = None                                           # must not be called
 
     def update(*arguments):
         seen.append(arguments)
@@ -136,9 +136,9 @@ BIASED = Environment("eitbench/Pipe2DSmoothing-v0",
 
 @pytest.mark.parametrize("environment", [FILTER, FIXED_LAG, SMOOTHING, BIASED],
                          ids=["filter", "fixed-lag", "smoothing", "biased"])
-def test_reference_with_the_true_model(environment):
-    """Whatever a board asks for and believes, the reference says what the smoother with the true velocity says: that of
-    the most probable inflow."""
+def test_oracle_with_the_true_model(environment):
+    """For every subtrack and assumption of the task, the oracle equals the smoother of the most probable inflow with
+    the true velocity."""
     reference, _ = run_episode(Job(environment, "true_model_smoother", 3))
     smoother, _ = run_episode(Job(SMOOTHING, "inflow_smoother", 3))
     assert (reference["role"], reference["privileged"]) == ("reference", True)
@@ -146,9 +146,9 @@ def test_reference_with_the_true_model(environment):
 
 
 @pytest.mark.parametrize("vessel", [{}, {"half_width": 0.06}], ids=["inflows", "states"])
-def test_reference_in_a_flow_that_changes(vessel):
-    """Told the flow of every step it errs less than the filter that is told the first guess, and knows the flow; also
-    where the inlet is another one than that of the prior that was learned."""
+def test_oracle_in_a_changing_flow(vessel):
+    """Its error is smaller than the filter's with the first guess, and it returns the true flow; also if the inlet
+    differs from the inlet of the fitted prior."""
     changes = merged(SCENARIO, {"schedule": {"scored_steps": 12}, "flow": {"velocity_range": [30.0, 60.0]},
                                 "vessel": vessel})
     world = Environment("eitbench/Pipe2DTimeVaryingVelocity-v0", json.dumps({"world": changes}))
@@ -158,8 +158,8 @@ def test_reference_in_a_flow_that_changes(vessel):
     assert reference["velocity_error"] < 1e-20 < guessing["velocity_error"]
 
 
-def test_what_estimators_do_to_their_arrays_changes_nothing(tmp_path):
-    """Overwriting measurements, or what was returned before, alters neither scores nor stored estimates."""
+def test_modified_arrays_of_estimators_change_nothing(tmp_path):
+    """Overwriting measurements, or a returned estimate, changes neither scores nor stored estimates."""
     said = "self.level[:] = 28.0 + self.calls; {}; {}; return Estimate(self.level, self.variance, self.nu, self.S)"
     init = "self.variance, self.nu, self.S = 4 + self.level, np.ones(4), np.eye(4)"
     new = "self.level, self.nu, self.S = self.level.copy(), voltages * self.calls, np.eye(4) / self.calls"
@@ -171,21 +171,21 @@ def test_what_estimators_do_to_their_arrays_changes_nothing(tmp_path):
     np.testing.assert_array_equal(rude_fields["mean"], fields["mean"])
 
 
-def test_estimators_cannot_spoil_the_task_for_others(tmp_path):
-    """A baseline that writes into the shared injection pattern harms, if anybody, itself."""
+def test_estimators_cannot_change_the_task_of_others(tmp_path):
+    """An estimator that overwrites the shared injection pattern affects at most its own results."""
     good = write_baseline(tmp_path, "good")
     before = scores_of(run_episode(Job(FILTER, good, 1))[0])
     run_episode(Job(FILTER, write_baseline(tmp_path, "vandal", init="task.currents[:] *= 3.0"), 1))
     try:
         assert scores_of(run_episode(Job(FILTER, good, 1))[0]) == before
     finally:
-        forget_made(runner)                                    # what a vandal broke is no other test's affair
+        forget_made(runner)                                    # remake the modified environment for other tests
 
 
 @pytest.mark.parametrize(("environment", "board"), [(FILTER, "filter"), (FIXED_LAG, "fixed-lag"),
                                                     (SMOOTHING, "smoothing")], ids=lambda value: str(value)[:9])
-def test_estimates_are_taken_for_the_state_that_was_asked_for(environment, board):
-    """At step i the state t = i − lag is asked for: on each board what was said of t stands at t."""
+def test_estimates_are_of_the_lagged_state(environment, board):
+    """At step i the state t = i − lag is estimated: in each subtrack the estimate of t is stored at t."""
     env = environment.make()
     assert subtrack_of(env) == board
 
@@ -202,7 +202,7 @@ def test_estimates_are_taken_for_the_state_that_was_asked_for(environment, board
 
 @pytest.fixture(scope="module")
 def tilted(tmp_path_factory):
-    """Result, estimates and true episode of a baseline whose field is exact in single precision, as it is stored."""
+    """Result, estimates and true episode of an estimator whose field is exact in single precision, as it is stored."""
     folder = tmp_path_factory.mktemp("tilted")
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv(CACHE_VARIABLE, str(folder))
@@ -215,7 +215,7 @@ def tilted(tmp_path_factory):
 
 
 def squared(mesh, values):
-    """∫f² of P1 fields (T, n) by the exact rule on each triangle, area/6·(a² + b² + c² + ab + bc + ca)."""
+    """Compute ∫f² of P1 fields (T, n) by the exact rule on each triangle, area/6·(a² + b² + c² + ab + bc + ca)."""
     a, b, c = (values[:, corner] for corner in mesh.cells.T)
     p, q, r = mesh.points[mesh.cells].transpose(1, 0, 2)
     area = 0.5 * np.abs((q - p)[:, 0] * (r - p)[:, 1] - (q - p)[:, 1] * (r - p)[:, 0])
@@ -223,7 +223,7 @@ def squared(mesh, values):
 
 
 def interpolated(mesh, values, points):
-    """P1 fields (T, n) at points (k, 2): each point tries every triangle and takes the one it lies deepest in."""
+    """Interpolate P1 fields (T, n) at points (k, 2), in the triangle that contains each point."""
     p, q, r = mesh.points[mesh.cells].transpose(1, 0, 2)
     to_barycentric = np.linalg.inv(np.stack([q - p, r - p], axis=2))
     result = np.empty((len(values), len(points)))
@@ -236,7 +236,7 @@ def interpolated(mesh, values, points):
 
 
 def test_scores_can_be_recomputed_from_what_is_stored(tilted):
-    """Relative and contrast error follow from the stored estimates and the simulated truth, by other code."""
+    """Relative and contrast error are recomputed from the stored estimates and the simulated truth, by other code."""
     result, means, episode = tilted
     env = FILTER.make()
     mesh, truth = cached_truth_model(env.world).transport.mesh, episode.concentration[1:].astype(float)
@@ -260,7 +260,7 @@ def test_scores_can_be_recomputed_from_what_is_stored(tilted):
 
 
 def test_minus_the_mean_reward_is_the_error(tilted):
-    """What the environment pays, from moments in single precision, is what the leaderboard reports."""
+    """The environment's rewards, from load vectors in single precision, agree with the error on the leaderboard."""
     result, means, _ = tilted
     env = FILTER.make()
     env.reset(seed=4)
@@ -274,7 +274,7 @@ def test_minus_the_mean_reward_is_the_error(tilted):
 
 
 def test_second_run_does_nothing(store, tmp_path):
-    """Finished episodes are not played again; failed ones are, and so is everything once the file has changed."""
+    """Finished episodes are not rerun; failed ones are, and all are if the file has changed."""
     log = tmp_path / "log"
     path = write_baseline(tmp_path, init=counting(log))
     jobs = [Job(FILTER, path, seed) for seed in (1, 2)]
@@ -291,7 +291,7 @@ def test_second_run_does_nothing(store, tmp_path):
 
 @pytest.mark.parametrize("how", ["KeyboardInterrupt", "SIGKILL"])
 def test_interrupted_run_resumes(how, store, tmp_path):
-    """Ctrl-C, or a kill without warning, in the third of four episodes: two are kept, and two remain to be done."""
+    """After Ctrl-C, or a kill, in the third of four episodes: two are stored, and two remain."""
     log, armed = tmp_path / "log", tmp_path / "armed"
     armed.touch()
     stop = "raise KeyboardInterrupt" if how == "KeyboardInterrupt" else "os.kill(os.getpid(), 9)"
@@ -311,7 +311,7 @@ def test_interrupted_run_resumes(how, store, tmp_path):
 
 
 def in_another_process(jobs, store):
-    """A started process that runs these jobs."""
+    """Return a started process that runs these jobs."""
     plain = [[list(job.environment), job.method, job.seed] for job in jobs]
     program = ("from pathlib import Path; from eitbench.bench.run import *\n"
                f"jobs = [Job(Environment(*environment), *rest) for environment, *rest in {plain!r}]\n"

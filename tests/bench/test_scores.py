@@ -1,4 +1,4 @@
-"""Scores: their formulas reach an episode, what they need is asked for, and a new one is shown everywhere."""
+"""Scores: their formulas, their required fields, and the display of a new score."""
 
 import csv
 import io
@@ -24,12 +24,12 @@ WORLD = entry("eitbench/Pipe2D-v0").world
 
 @pytest.fixture
 def apart(monkeypatch):
-    """Whatever is registered is forgotten after the test."""
+    """Remove registrations of a test after it."""
     monkeypatch.setattr(scores, "_scores", dict(scores.scores()))
 
 
 def outcome(**given):
-    """Two states of two nodes; the estimate is off by (1, 0) and (0, 2), at masses 1 and 3."""
+    """Two states of two nodes with estimation errors (1, 0) and (0, 2), at masses 1 and 3."""
     truth = np.array([[4.0, 2.0], [4.0, 2.0]])
     return Outcome(WORLD, 0.5, np.array([0.1, 0.3]), mean=truth + np.diag([1.0, 2.0]), truth=truth,
                    mass=np.diag([1.0, 3.0]), points=np.zeros((2, 2)), homogeneous=3.0, **given)
@@ -44,8 +44,8 @@ def test_numbers_by_hand():
     assert "spent" not in said
 
 
-def test_innovations_and_velocity_where_they_are_claimed():
-    """ν = (2, 0) with S = diag(1, 4) has NIS/m = 2; a velocity 10 % too high everywhere has 0.01."""
+def test_innovations_and_velocity_if_reported():
+    """ν = (2, 0) with S = diag(1, 4) has NIS/m = 2; a velocity that is 10 % too high everywhere has 0.01."""
     innovations = np.array([[2.0, 0.0]]), np.diag([1.0, 4.0])[None]
     velocity = np.full((2, 3), 1.1), np.ones((2, 3)), np.full(3, 0.2)
     said = compute_scores("estimation", outcome(innovations=innovations, velocity=velocity))
@@ -53,7 +53,7 @@ def test_innovations_and_velocity_where_they_are_claimed():
 
 
 def test_policies_have_theirs():
-    """Error, injections, time, and of what the filter claims nothing where nobody asked it."""
+    """Policies have error, injections, time, and scores of the filter's uncertainty if it is available."""
     said = compute_scores("injection", Outcome(WORLD, 0.5, np.array([0.1, 0.3]), n_injections=7))
     claims = dict.fromkeys(("nis", "crps", "coverage_50", "coverage_90", "spread_ratio"))
     assert said == claims | {"error": pytest.approx(0.2), "spent": 7.0, "seconds_per_step": 0.5}
@@ -65,7 +65,7 @@ def worst(direction="lower"):
 
 
 def test_a_new_score_is_shown_everywhere(apart):
-    """One call, and it is in episodes, summaries, CSV, Markdown, pages and comparisons, in its unit."""
+    """After one call it is in episodes, summaries, CSV, Markdown, pages and comparisons, in its unit."""
     register_score(worst())
     assert compute_scores("estimation", outcome())["worst_step"] == pytest.approx(0.3)
     records = [record for record in read_records(PUBLISHED)
@@ -92,8 +92,8 @@ def test_a_new_score_is_shown_everywhere(apart):
     assert said(compare.comparison_table(table, "kalman", "floor", "worst_step"))["verdict"][0] == "kalman"
 
 
-def test_where_more_is_better_the_other_wins(apart):
-    """The verdict turns round with the score."""
+def test_higher_scores_can_be_better(apart):
+    """The sign of the comparison follows the direction of the score."""
     register_score(worst("higher"))
     records = {record["method"]: record for record in read_records(PUBLISHED)
                if record["environment"]["name"] == "eitbench-Pipe2D-v0"}
@@ -106,8 +106,8 @@ def test_where_more_is_better_the_other_wins(apart):
 
 
 @pytest.mark.parametrize("name", ["nis", "voltage_discrepancy", "beauty"])
-def test_only_scores_that_can_be_better_are_compared(name):
-    """The message names those that can."""
+def test_only_scores_with_a_direction_are_compared(name):
+    """The message lists the scores that can."""
     record = json.loads((next(PUBLISHED.glob("eitbench-Pipe2D-v0--kalman*"))).read_text())
     with pytest.raises(ValueError, match=f"score must be one of error, .*got '{name}'"):
         compare.compare([record], [record], name)
@@ -121,8 +121,8 @@ def test_only_scores_that_can_be_better_are_compared(name):
     ({"requires": ("luck",)}, "requires must be among world, .*got 'luck'"),
     ({"tracks": ("sprint",)}, "tracks must be among estimation, injection, measured; got 'sprint'"),
     ({"factor": 0.0}, "factor must be")])
-def test_bad_scores_are_refused(changes, message, apart):
-    """Before anything is registered."""
+def test_invalid_scores_are_rejected(changes, message, apart):
+    """Nothing is registered."""
     before = list(scores.scores())
     given = {"name": "mine", "heading": "mine", "explanation": "", "compute": lambda outcome: 0.0} | changes
     with pytest.raises(ValueError, match=message):
@@ -130,8 +130,8 @@ def test_bad_scores_are_refused(changes, message, apart):
     assert list(scores.scores()) == before
 
 
-def test_a_score_that_is_no_number_is_refused(apart):
-    """It is named; None means that there is nothing to be said."""
+def test_a_score_that_is_not_a_number_is_rejected(apart):
+    """The message has the name; None is an undefined score."""
     register_score(Score("mine", "mine", "", lambda outcome: np.nan))
     with pytest.raises(ValueError, match="score mine"):
         compute_scores("estimation", outcome())

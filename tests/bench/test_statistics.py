@@ -1,4 +1,4 @@
-"""Statistics of a board: against numbers done by hand, brute force, and what intervals are for: coverage."""
+"""Statistics of a leaderboard: comparison with hand-computed numbers and brute force, and coverage of intervals."""
 
 import json
 import math
@@ -22,18 +22,18 @@ from scipy import stats
 
 
 def seeded(values, split="test"):
-    """Seed -> score: one environment of one method."""
+    """Return environment -> seed -> score for one environment of one method."""
     return {f"{split}:{i}": float(value) for i, value in enumerate(values)}
 
 
 def shuffled(scores, random):
-    """The same scores, environments and seeds listed in another order."""
+    """Return the same scores with environments and seeds in another order."""
     return {environment: {str(seed): own[seed] for seed in random.permutation(list(own))}
             for environment, own in reversed(scores.items())}
 
 
 def two_methods(seed=5):
-    """Scores of two methods on shared hard and easy episodes of three environments, some of them equal."""
+    """Return scores of two methods on shared hard and easy episodes of three environments, some of them equal."""
     random = np.random.default_rng(seed)
     a, b = {}, {}
     for environment, n in (("pipe", 12), ("tank", 20), ("obstacle", 9)):
@@ -44,7 +44,7 @@ def two_methods(seed=5):
 
 
 def plain(scores):
-    """Environment -> list of scores."""
+    """Return environment -> list of scores."""
     return {environment: list(own.values()) for environment, own in scores.items()}
 
 
@@ -53,7 +53,7 @@ def plain(scores):
 
 @pytest.mark.parametrize("n", range(1, 30))
 def test_interquartile_mean_is_scipys(n):
-    """The 25 % trimmed mean, of the environments pooled and for any number of draws at once."""
+    """It is the 25 % trimmed mean of the pooled environments, also for several resamples at once."""
     scores = np.random.default_rng(n).normal(size=(4, n))
     assert interquartile_mean(scores) == pytest.approx(stats.trim_mean(scores, 0.25, axis=1), rel=1e-12)
     assert interquartile_mean(*scores) == pytest.approx(stats.trim_mean(scores, 0.25, axis=None), rel=1e-12)
@@ -72,9 +72,9 @@ def test_interquartile_mean_pools_and_the_mean_does_not():
     (6, mean_over_environments, 0.932), (10, mean_over_environments, 0.944), (30, mean_over_environments, 0.950),
     (6, interquartile_mean, 0.955), (10, interquartile_mean, 0.972), (30, interquartile_mean, 0.959)])
 def test_coverage(n, statistic, expected):
-    """Intervals that hold the truth, of 1000 data sets of n normal numbers: as of 6000 others, to 3 standard errors.
+    """The coverage of 1000 intervals for n normal numbers agrees with 6000 other data sets to 3 standard errors.
 
-    Not cut as Student's t would they are too few: 0.854, 0.902 and 0.938 for the mean, 0.904, 0.937 and 0.948.
+    Without the expansion by Student's t it is too small: 0.854, 0.902 and 0.938 for the mean, 0.904, 0.937 and 0.948.
     """
     repeats, random = 1000, np.random.default_rng(11)
     held = 0
@@ -85,9 +85,9 @@ def test_coverage(n, statistic, expected):
 
 
 def test_coverage_over_environments():
-    """Strata of different size, mean and spread: the mean of their means, of 400 data sets, 95 % within ± 3.3 %.
+    """For strata of different size, mean and variance, 95 % ± 3.3 % of 400 intervals contain the mean of their means.
 
-    Pooled resampling would take the distance between environments for noise and cover always.
+    Pooled resampling would treat the differences between environments as noise, and the coverage would be 100 %.
     """
     random, held, width = np.random.default_rng(12), 0, []
     for _ in range(400):
@@ -100,8 +100,8 @@ def test_coverage_over_environments():
     assert np.mean(width) == pytest.approx(expected, rel=0.03)
 
 
-def test_too_few_episodes_claim_nothing():
-    """Five episodes, or one alone in its environment, give no interval; six do."""
+def test_too_few_episodes_have_no_interval():
+    """Five episodes, or a single one in an environment, have no interval; six have one."""
     a, b = np.arange(5.0), np.arange(10.0)
     assert stratified_bootstrap({"pipe": a}, mean_over_environments) == (2.0, -math.inf, math.inf)
     assert stratified_bootstrap({"pipe": [1.0], "tank": b}, mean_over_environments)[1:] == (-math.inf, math.inf)
@@ -111,14 +111,14 @@ def test_too_few_episodes_claim_nothing():
 
 
 def everything():
-    """Each kind of interval once."""
+    """Return one interval of each kind."""
     a, b = two_methods()
     return [stratified_bootstrap(plain(a), interquartile_mean), stratified_bootstrap(plain(a), mean_over_environments),
             paired_difference(a, b), paired_probability_of_improvement(a, b)]
 
 
 def test_the_same_numbers_in_another_process():
-    """To the last bit, whatever the hashes of the names are there; another seed gives other intervals."""
+    """The intervals are equal to the last bit for other hashes of strings; another seed gives other intervals."""
     here = json.loads(json.dumps(everything()))
     code = "import json; from test_statistics import everything; print(json.dumps(everything()))"
     environment = os.environ | {"PYTHONHASHSEED": "1", "PYTHONPATH": os.pathsep.join(path for path in sys.path if path)}
@@ -133,8 +133,8 @@ def test_the_same_numbers_in_another_process():
 # -- pairs ------------------------------------------------------------------------------------------------------------
 
 
-def test_what_is_hard_for_both_cancels():
-    """1/4 worse on every one of very different episodes is exactly that; unpaired nothing would be seen."""
+def test_difficulty_of_episodes_cancels():
+    """An improvement of 1/4 on each of very different episodes is exactly recovered."""
     b = {"pipe": seeded(2.0 ** np.arange(10)), "tank": seeded(3.0 * np.arange(7))}
     a = {environment: {seed: score + 0.25 for seed, score in reversed(own.items())} for environment, own in b.items()}
     assert paired_difference(a, b) == pytest.approx((0.25, 0.25, 0.25), rel=1e-12)
@@ -142,8 +142,8 @@ def test_what_is_hard_for_both_cancels():
 
 
 def test_paired_interval_is_scipys():
-    """One environment: scipy's paired bootstrap percentile interval of the mean difference, to Monte-Carlo error, cut
-    where the half-width of the mean of 40 normal numbers is Student's."""
+    """For one environment it agrees, within Monte-Carlo error, with scipy's paired percentile bootstrap interval at
+    Student's percentiles for 40 normal numbers."""
     random = np.random.default_rng(3)
     x, y = random.normal(0.0, 1.0, (2, 40))
     cut = stats.norm.sf(stats.t(39).ppf(0.975) * math.sqrt(40 / 39))
@@ -157,7 +157,7 @@ def test_paired_interval_is_scipys():
 
 
 def test_paired_difference_of_interquartile_means():
-    """The difference of the two statistics, as a loop that draws the same episodes for both, to Monte-Carlo error."""
+    """It agrees, within Monte-Carlo error, with a loop that resamples the same episodes for both methods."""
     a, b = two_methods()
     random, differences = np.random.default_rng(6), []
     for _ in range(4000):
@@ -179,14 +179,14 @@ def test_paired_difference_of_interquartile_means():
 @pytest.mark.parametrize("statistic", [mean_over_environments, interquartile_mean])
 @pytest.mark.parametrize("seed", range(5))
 def test_exchanged_methods_have_the_negative_difference(seed, statistic):
-    """To the last bit: a comparison does not depend on the method that is named first."""
+    """The result is equal to the last bit if the methods are exchanged and the sign is changed."""
     a, b = two_methods(seed)
     value, low, high = paired_difference(a, b, statistic=statistic, seed=seed)
     assert paired_difference(b, a, statistic=statistic, seed=seed) == (-value, -high, -low)
 
 
 def test_only_shared_seeds_count():
-    """Scores on other seeds change nothing, however bad they are; environments weigh the same."""
+    """Scores on other seeds change nothing; environments have equal weights."""
     a = {"pipe": seeded(np.arange(8.0)), "tank": seeded(np.arange(6.0))}
     b = {"pipe": seeded([3.0] * 8)}
     b["tank"] = {seed: score - 2.0 for seed, score in a["tank"].items()}
@@ -197,7 +197,7 @@ def test_only_shared_seeds_count():
     assert paired_difference(a, {"pipe": b["pipe"] | {"test:98": -1e6}, "tank": b["tank"]}) == expected
 
 
-def test_paired_share():
+def test_paired_probability_of_improvement():
     """Better in 3 of 8 and equal in 2: (3 + 1)/8, and 1 in the other environment; higher may be better."""
     a, b = [0, 0, 0, 1, 1, 2, 2, 2], [1, 1, 1, 1, 1, 1, 1, 1]
     one, other = {"pipe": seeded(a), "tank": seeded([0] * 4)}, {"pipe": seeded(b), "tank": seeded([1] * 4)}
@@ -213,7 +213,7 @@ NOISE = np.tile([-1.0, 1.0], 6)
 
 
 def board(**methods):
-    """Method -> its scores in a single environment."""
+    """Return method -> its scores in a single environment."""
     return {method: {"pipe": seeded(scores)} for method, scores in methods.items()}
 
 
@@ -226,33 +226,33 @@ PIPE_AND_TANK = {"b": {"pipe": seeded(np.ones(6)), "tank": seeded(np.zeros(60))}
     # each worse than the one before on every episode, best first; higher may be better
     (board(c=NOISE + 3, a=NOISE + 1, b=NOISE + 2), {}, {"a": 1, "b": 2, "c": 3}),
     (board(c=NOISE + 3, a=NOISE + 1, b=NOISE + 2), {"higher_is_better": True}, {"c": 1, "b": 2, "a": 3}),
-    # two that cannot be told apart share a rank, and the one that both beat is third; equal scores share
+    # two methods without a significant difference share rank 1, and the third is worse than both; equal scores share
     (board(last=10 * ONE, a=0.1 * NOISE, b=0.01 - 0.1 * NOISE), {}, {"a": 1, "b": 1, "last": 3}),
     (board(c=NOISE + 1, b=NOISE, a=NOISE), {}, {"a": 1, "b": 1, "c": 3}),
     (board(a=NOISE), {}, {"a": 1}), ({}, {}, {}),
-    # intervals of the scores overlap widely, but one is better by a little on every episode
+    # intervals of the scores overlap widely, but one is slightly better on every episode
     (board(a=100 * NOISE, b=100 * NOISE + 0.5), {}, {"a": 1, "b": 2}),
-    # not transitive: a and b cannot be told apart, nor b and c, but a is better than c
+    # not transitive: no significant difference of a and b, nor of b and c, but a is better than c
     (board(a=0 * NOISE, b=0.5 + 1.5 * NOISE, c=ONE), {}, {"a": 1, "b": 1, "c": 2}),
-    # a scattered method has a worse mean than one of rank 2, and nothing was shown to be better
+    # a method with large variance has a worse mean than a method of rank 2, and no significant difference
     (board(a=0 * NOISE, b=0.1 * ONE, c=0.5 + 3 * NOISE), {}, {"a": 1, "b": 2, "c": 1}),
-    # a single disaster decides the mean, and not the interquartile mean
+    # a single outlier affects the mean, and not the interquartile mean
     (board(a=np.zeros(24), b=np.r_[np.full(23, -1.0), 100.0]), {}, {"a": 1, "b": 1}),
     (board(a=np.zeros(24), b=np.r_[np.full(23, -1.0), 100.0]), {"statistic": interquartile_mean}, {"b": 1, "a": 2}),
-    # without a rank, and without a say
+    # unranked methods do not affect ranks
     (board(seer=NOISE, a=NOISE + 1, floor=NOISE + 2, b=NOISE + 3), {"unranked": {"seer", "floor"}},
      {"seer": None, "a": 1, "floor": None, "b": 2}),
-    # environments weigh the same: better by 1 in 6 episodes, worse by 0.5 in 60
+    # equal weights of environments: better by 1 in 6 episodes, worse by 0.5 in 60
     (PIPE_AND_TANK, {}, {"a": 1, "b": 2}),
-    # better on all of four episodes is no evidence: one of two equal methods is, in one board of eight
+    # four better episodes are not significant: for equal methods the probability is 1/8
     (board(a=NOISE[:4], b=NOISE[:4] + 1), {}, {"a": 1, "b": 1})])
 def test_shared_ranks(scores, how, expected):
-    """Rank and order of each method."""
+    """Rank and order of each method are as expected."""
     assert list(shared_ranks(scores, **how).items()) == list(expected.items())
 
 
 def by_the_definition(scores, unranked, statistic, higher):
-    """Method -> one more than the number of methods that are significantly better, pair by pair."""
+    """Return method -> one plus the number of methods that are significantly better, pair by pair."""
     ranked = [name for name in scores if name not in unranked]
     ranks = dict.fromkeys(scores)
     for name in ranked:
@@ -263,7 +263,7 @@ def by_the_definition(scores, unranked, statistic, higher):
 
 
 def a_board(seed):
-    """Methods close to each other or not, with ties and a twin."""
+    """Return random scores of methods with large or small differences, with ties and duplicates."""
     random = np.random.default_rng(seed)
     sizes = random.integers(2, 14, size=random.integers(1, 4))
     spread, digits = random.choice([0.0, 0.05, 1.0]), int(random.choice([1, 2, 15]))
@@ -277,8 +277,8 @@ def a_board(seed):
 
 @pytest.mark.parametrize("higher", [False, True])
 @pytest.mark.parametrize("statistic", [mean_over_environments, interquartile_mean])
-def test_ranks_are_those_of_the_definition(statistic, higher):
-    """Ranks count significant paired differences, for boards of every kind, in any order of listing."""
+def test_ranks_agree_with_the_definition(statistic, higher):
+    """Ranks count significant paired differences, for random leaderboards in any order."""
     for seed in range(12):
         scores, unranked = a_board(seed), {"m1"} if seed % 2 else set()
         listed = {name: shuffled(scores[name], np.random.default_rng(seed)) for name in reversed(scores)}
@@ -288,7 +288,7 @@ def test_ranks_are_those_of_the_definition(statistic, higher):
         assert values == pytest.approx(sorted(values, reverse=higher), rel=1e-12)
 
 
-# -- what cannot be computed ------------------------------------------------------------------------------------------
+# -- errors -----------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(("call", "message"), [
@@ -311,21 +311,21 @@ def test_ranks_are_those_of_the_definition(statistic, higher):
     (lambda: shared_ranks({"a": {"pipe": {}}}), "scores must be finite, of at least one"),
 ])
 def test_errors_name_the_argument(call, message):
-    """What cannot be computed says why."""
+    """The message explains the reason."""
     with pytest.raises(ValueError, match=message):
         call()
 
 
 @pytest.mark.parametrize("statistic", [interquartile_mean, mean_over_environments])
 def test_constant_environments_have_no_interval(statistic):
-    """Nothing is uncertain about two environments that always score 0.25 and 0.75, however far apart they are."""
+    """Two environments that always score 0.25 and 0.75 have an interval of length zero."""
     scores = {"pipe": [0.25] * 8, "tank": [0.75] * 8}
     assert stratified_bootstrap(scores, statistic) == (0.5, 0.5, 0.5)
 
 
 @pytest.mark.parametrize("order", range(3))
 def test_the_order_of_episodes_does_not_matter(order):
-    """Pairs are found by their seeds, and the intervals are the same to the last bit."""
+    """Pairs are matched by their seeds, and intervals are equal to the last bit."""
     random = np.random.default_rng(order)
     a, b = two_methods()
     one, other = shuffled(a, random), shuffled(b, random)

@@ -1,4 +1,4 @@
-"""Results on disk: whole or not at all, nobody's lost, and records that say all that is needed to repeat them."""
+"""Results on disk: atomic writes, concurrent writers, and records with all data for a rerun."""
 
 import json
 import math
@@ -26,7 +26,7 @@ ENV, COMMAND = "eitbench/Pipe2D-v0", "eitbench run --seeds train:1-2"
 
 @pytest.fixture(autouse=True)
 def surroundings(monkeypatch):
-    """A commit that doesn't depend on where the tests run."""
+    """Use a commit that does not depend on the folder of the tests."""
     git_says(monkeypatch, "c0ffee")
 
 
@@ -36,7 +36,7 @@ def store(tmp_path):
 
 
 def result(seed=1, method="mine", **changes):
-    """A result such as `run_episode` makes."""
+    """Return a result as `run_episode` does."""
     return {"identity": "abc", "seed": format_seed(seed), "method": method, "title": "Mine", "parameters": {},
             "role": None, "privileged": False, "method_sha256": sha("mine"), "version": sha("mine")[:8],
             "checkpoint_sha256": None,
@@ -47,13 +47,13 @@ def result(seed=1, method="mine", **changes):
 
 
 def failed(seed):
-    """The result of an episode that was not finished."""
+    """Return the result of a failed episode."""
     made = {name: value for name, value in result(seed).items() if name not in ("scores", "step_errors")}
     return made | {"status": "failed", "message": "broke", "where": "mine.py:1"}
 
 
 def put(store, made, fields=None):
-    """Store a result where it belongs."""
+    """Store a result under its names."""
     seed = int(made["seed"].removeprefix("train:"))
     store.put(made["environment"]["name"], made["method"], seed, made, fields or {})
 
@@ -62,7 +62,7 @@ def put(store, made, fields=None):
 
 
 def test_round_trip(store):
-    """Results and estimates come back as they were put, for every baseline and seed."""
+    """Results and estimates are read as they were stored, for every estimator and seed."""
     mean = np.random.default_rng(1).normal(size=(5, 7)).astype(np.float32)
     for baseline, seed in (("mine", 1), ("mine", 2), ("yours", 1)):
         put(store, result(seed, baseline), {"mean": seed * mean})
@@ -74,7 +74,7 @@ def test_round_trip(store):
 
 
 def test_only_a_success_of_the_same_identity_is_held(store):
-    """What failed, was made by other code, or belongs to another seed counts as not done."""
+    """Failed results, other code and other seeds do not count as done."""
     put(store, result())
     put(store, failed(2))
     assert store.has_result(ENV, "mine", 1, "abc")
@@ -85,28 +85,28 @@ def test_only_a_success_of_the_same_identity_is_held(store):
 
 
 @pytest.mark.parametrize("number", [math.nan, math.inf, -math.inf])
-def test_no_number_that_json_lacks_is_written(number, store):
-    """NaN and Infinity are refused before anything is replaced."""
+def test_numbers_that_json_lacks_are_rejected(number, store):
+    """NaN and Infinity are rejected before any file is replaced."""
     put(store, result())
     with pytest.raises(ValueError, match="JSON"):
         put(store, result(scores={"error": number}))
     assert [r["scores"]["error"] for r in store.results()] == [0.1]
 
 
-def test_writers_at_once_lose_nothing(store):
-    """Eight threads, sixty-four episodes and a reader that never meets half a file."""
+def test_concurrent_writers_lose_nothing(store):
+    """Eight threads write sixty-four episodes, and a reader never reads an incomplete file."""
     together = threading.Barrier(9)
     looked, over = threading.Event(), threading.Event()
 
     def write(worker):
         together.wait()
         for seed in range(8):
-            if seed == 4:                                           # a busy machine may let the reader wait till then
+            if seed == 4:                                           # the reader may start late on a busy machine
                 looked.wait()
             put(store, result(8 * worker + seed, f"baseline{worker % 2}"), {"mean": np.ones((2, 2))})
 
     def read():
-        """Episodes of each record at each look, the last when nobody writes any more."""
+        """Return the episodes of each record at each reading; the last after all writers have ended."""
         together.wait()
         is_last = False
         while not is_last:
@@ -135,7 +135,7 @@ def test_writers_at_once_lose_nothing(store):
 
 @pytest.fixture(scope="module")
 def played(tmp_path_factory):
-    """A folder in which one baseline has played two episodes, and failed in a third."""
+    """A folder in which one estimator has finished two episodes and failed in a third."""
     folder = tmp_path_factory.mktemp("played")
     update = "assert voltages[0] != 0 or Path('x').exists(), 'silent'\n        return Estimate(self.level)"
     with pytest.MonkeyPatch.context() as patch:
@@ -148,8 +148,8 @@ def played(tmp_path_factory):
     return EpisodeStore(folder)
 
 
-def test_record_says_how_to_repeat_it(played):
-    """Environment with arguments, baseline with parameters and hash, command, seeds, versions, commit, machine."""
+def test_records_can_be_reproduced(played):
+    """Environment with arguments, estimator with parameters and hash, command, seeds, versions, commit, machine."""
     bad, mine = sorted(played.write_records(), key=lambda record: record["method"])
     assert mine["environment"]["id"] == ENV and mine["environment"]["kwargs"]["world"] == SCENARIO
     assert (mine["method"], mine["title"], mine["board"]) == ("mine", "Mine", "filter")
@@ -168,7 +168,7 @@ def test_record_says_how_to_repeat_it(played):
 
 
 def test_record_holds_every_episode(played):
-    """Scores, the error of each scored step, and time; or the reason of a failure."""
+    """An episode has scores, the error of each scored step, and time; or the reason of a failure."""
     bad, mine = sorted(played.write_records(), key=lambda record: record["method"])
     for episode in mine["episodes"]:
         assert episode["status"] == "ok" and episode["seconds"] > 0 and episode["finished"]
@@ -177,13 +177,13 @@ def test_record_holds_every_episode(played):
         assert len(episode["step_errors"]) == 3
         assert episode["scores"]["error"] == pytest.approx(np.mean(episode["step_errors"]), rel=1e-12)
     assert [episode["message"] for episode in bad["episodes"]] == 2 * ["RuntimeError: no"]
-    # where it went wrong, but not in whose folder
+    # location of the error, without folders
     assert all(re.fullmatch(r"bad\.py:\d+", episode["where"]) for episode in bad["episodes"])
     assert not any("scores" in episode for episode in bad["episodes"])
 
 
 def test_each_episode_keeps_the_run_that_made_it(store):
-    """Episodes of several runs stand in one record, which names every run and says which made which."""
+    """A record with episodes of several runs holds every run and the run of each episode."""
     put(store, result(1))
     put(store, result(2, run=RUN | {"command": "later"}))
     put(store, result(3))
@@ -193,7 +193,7 @@ def test_each_episode_keeps_the_run_that_made_it(store):
 
 
 def test_splits_are_not_mixed(store):
-    """Development and training seeds never enter the record of another split; seeds are in numerical order."""
+    """Development and training seeds are never in the record of another split; seeds are in numerical order."""
     for seed in (10, 9, 100):
         put(store, result(seed))
     store.put(ENV, "mine", 100_001, result(1) | {"seed": format_seed(100_001)}, {})
@@ -203,8 +203,7 @@ def test_splits_are_not_mixed(store):
 
 @pytest.mark.parametrize("what", ["scoring", "method_sha256"])
 def test_stale_results_are_not_mixed_in(what, store):
-    """Only episodes of the code that ran here last make the record; the older ones join again when they are
-    replayed."""
+    """A record has only episodes of the latest code; older ones are included again after they are rerun."""
     def of(code):
         if what == "scoring":
             return {"run": RUN | {"versions": RUN["versions"] | {"scoring": code}}}
@@ -221,10 +220,10 @@ def test_stale_results_are_not_mixed_in(what, store):
     assert [record["seeds"] for record in store.write_records()] == [["train:1", "train:2"]]
 
 
-def test_a_record_names_the_machine_that_played(store, tmp_path, monkeypatch):
-    """Not the one that started the run: the processes of a cluster may be elsewhere. Those of one machine
-    say the same."""
-    monkeypatch.setattr(store_module, "matmul_seconds", lambda: 123.0)      # here, and not in the processes
+def test_a_record_has_the_machine_of_the_worker(store, tmp_path, monkeypatch):
+    """The record has the machine of the worker, which may differ from the machine that started the run; processes of
+    one machine report the same."""
+    monkeypatch.setattr(store_module, "matmul_seconds", lambda: 123.0)      # in this process only
     jobs = [Job(FILTER, write_baseline(tmp_path), seed) for seed in (1, 2)]
     for node, elsewhere in ((platform.node(), False), ("another", True)):
         machine.cache_clear()
@@ -242,14 +241,14 @@ def test_a_record_names_the_machine_that_played(store, tmp_path, monkeypatch):
     ("eitbench run --policy baselines/a/model.zip", "eitbench run --policy baselines/a/model.zip"),
     ("eitbench run --baseline '/home/a b/it.py' 'c d'", "eitbench run --baseline it.py 'c d'"),
     ("it's", "\"it's\""), ("", "")])
-def test_a_command_names_no_folder_of_the_machine(typed, kept):
-    """Output folders go; of other paths that are absolute or lead upwards the name stays."""
+def test_a_command_has_no_folder_of_the_machine(typed, kept):
+    """Output folders are removed; absolute paths and paths with `..` are reduced to their names."""
     assert shlex.split(portable_command(typed)) == shlex.split(kept)
 
 
 def test_other_results_fill_what_is_missing_or_failed(store):
-    """An episode that was played well here stays; results of another version do not come in with it, those of other
-    code do."""
+    """Successful results of the store are kept; results of other code complete them, results of other versions do
+    not."""
     put(store, result(1, seconds=2.0))
     put(store, failed(2))
     others = [result(1, seconds=9.0), result(2, seconds=3.0),
@@ -264,7 +263,7 @@ def test_other_results_fill_what_is_missing_or_failed(store):
 
 
 def test_provenance_without_git(monkeypatch):
-    """Outside a repository there is no commit to name, and that is no error."""
+    """Without a repository the commit is None."""
     monkeypatch.undo()
     monkeypatch.setenv("PATH", "")
     provenance.cache_clear()
@@ -272,7 +271,7 @@ def test_provenance_without_git(monkeypatch):
 
 
 def test_arguments_of_an_environment_make_other_records(store, tmp_path):
-    """The same id with other keyword arguments is another world: neither results nor records overwrite each other."""
+    """Other keyword arguments of an id are another world: neither results nor records are overwritten."""
     path = write_baseline(tmp_path)
     wider = Environment(FILTER.id, json.dumps({"world": SCENARIO | {"instrument": {"noise_relative": 0.02}}}))
     run_jobs([Job(environment, path, 1) for environment in (FILTER, wider, FIXED_LAG)], store)

@@ -1,4 +1,4 @@
-"""Submitting: test episodes are played, and their records written, failures and all; `eitbench` does it by command."""
+"""Submissions: test episodes are run, and records written, including failures, by the command `eitbench submit`."""
 
 import re
 
@@ -20,14 +20,14 @@ TEST = parse_seeds("test:0-1")
 
 @pytest.fixture(autouse=True)
 def tiny_world(monkeypatch, tmp_path):
-    """The registered environments play tiny worlds, in an empty folder, from a clean commit."""
+    """Use tiny worlds for the registered ids, an empty folder, and a clean commit."""
     git_says(monkeypatch, "c0ffee")
     shorten(monkeypatch, {FILTER.id: SCENARIO, SMOOTHING.id: SCENARIO, INJECTION: PIPE})
     monkeypatch.chdir(tmp_path)
 
 
-def test_a_submission_is_a_record_an_environment(tmp_path):
-    """Self-reported unless said otherwise; the same again plays nothing, and official is a matter of the flag."""
+def test_a_submission_is_a_record_per_environment(tmp_path):
+    """Records are self-reported without the flag; the same command runs nothing."""
     log = tmp_path / "log"
     mine, store, to = write_baseline(tmp_path, init=counting(log)), EpisodeStore(tmp_path / "results"), tmp_path / "to"
     paths = list(submit(mine, [FILTER.id, SMOOTHING.id], TEST, store, to, isolate="none",
@@ -43,8 +43,8 @@ def test_a_submission_is_a_record_an_environment(tmp_path):
     assert [record["official"] for record in read_records(to)] == [True, False]
 
 
-def test_all_of_ours_by_one_command(tmp_path, monkeypatch):
-    """Those that play, environment after environment: what is done has its record when a later one is interrupted."""
+def test_all_built_in_methods_by_one_command(tmp_path, monkeypatch):
+    """All compatible methods run, by environment: finished environments have records after an interruption."""
     ours = {"estimation": ["homogeneous", "fixed_interval_smoother"],
             "injection": ["random_pair", "event_triggered"]}
     monkeypatch.setattr(suites, "builtin_methods", ours.get)
@@ -56,7 +56,7 @@ def test_all_of_ours_by_one_command(tmp_path, monkeypatch):
 
 
 def test_failures_are_submitted_too(tmp_path):
-    """Nothing is dropped: who fails in one episode has a record that says so."""
+    """A method with a failed episode has a record with the failure."""
     fails = write_baseline(tmp_path, update="assert self.calls < 2, 'dry'\n        return Estimate(self.level)")
     (path,) = submit(fails, [FILTER.id], TEST, EpisodeStore(tmp_path), tmp_path / "to", isolate="none")
     episodes = read_record(path)["episodes"]
@@ -65,7 +65,7 @@ def test_failures_are_submitted_too(tmp_path):
 
 
 def test_policies_by_command(tmp_path):
-    """`policies` prints scores and resumes; what it played stands in the table and on the page of `leaderboard`."""
+    """`run` prints scores and resumes; its episodes are in the table and on the page of `leaderboard`."""
     command = ("run", "--env", INJECTION, "--policy", "adjacent", "--policy", "random_pair", "--policy",
                "clairvoyant", "--seeds", "test:0-1", "--estimator", "reduced", "-j", "1")
     code, said, _ = eitbench(*command)
@@ -79,8 +79,8 @@ def test_policies_by_command(tmp_path):
     assert "Pipe2DInjection" in (tmp_path / "results" / "index.html").read_text(encoding="utf-8")
 
 
-def test_policies_in_records_are_not_played_again(tmp_path):
-    """The table is that of all the episodes; only those that no record holds are played."""
+def test_policies_in_records_are_not_rerun(tmp_path):
+    """The table has all episodes; only episodes without a record are run."""
     policy, short = ("--env", INJECTION, "--policy", "adjacent"), ("-j", "1", "-o")
     assert eitbench("submit", *policy, "--seeds", "test:0", *short, "first")[0] == 0
     code, said, _ = eitbench("run", *policy, "--seeds", "test:0-1", "--records", "leaderboards/results", *short,
@@ -97,18 +97,18 @@ def test_policies_in_records_are_not_played_again(tmp_path):
     ([FILTER.id], "7", "must be of the split test, got train:7"),
     ([FILTER.id], "400000", "must be of the split test, got 400000"),
     ([], "test:0", "env must name at least one environment"),
-    ([FILTER.id, SMOOTHING.id], "test:0", f"baseline kalman_filter plays none of the environments {SMOOTHING.id}"),
+    ([FILTER.id, SMOOTHING.id], "test:0", f"baseline kalman_filter suits none of the environments {SMOOTHING.id}"),
     (["eitbench/Pipe4D-v0"], "test:0", "env must be one of"),
 ])
-def test_what_cannot_be_submitted(environments, seeds, message, tmp_path):
-    """The call says so, before it is iterated; nothing is run, and nothing written."""
+def test_invalid_submissions(environments, seeds, message, tmp_path):
+    """The call raises the error before the iteration; nothing is run or written."""
     with pytest.raises(ValueError, match=message):
         submit("kalman_filter", environments, parse_seeds(seeds), EpisodeStore(tmp_path / "r"), tmp_path / "to")
     assert not (tmp_path / "r").exists() and not (tmp_path / "to").exists()
 
 
 def test_official_needs_a_clean_commit(tmp_path, monkeypatch):
-    """It is said before anything is played, and so stands in nobody's way once the changes are committed."""
+    """The error is raised before any episode is run; after a commit the same call succeeds."""
     to = tmp_path / "to"
 
     def official():
@@ -124,9 +124,9 @@ def test_official_needs_a_clean_commit(tmp_path, monkeypatch):
     assert read_record(path)["official"]
 
 
-def test_what_says_more_is_not_replaced(tmp_path, monkeypatch):
-    """By a record that is no longer official, or has fewer episodes, whatever code played; one of a newer version
-    stands beside it."""
+def test_official_and_longer_records_are_not_replaced(tmp_path, monkeypatch):
+    """Unofficial records and records with fewer episodes are rejected, for any commit; a newer version has a separate
+    record."""
     to = tmp_path / "to"
 
     def submitted(results, seeds, **how):
@@ -134,16 +134,16 @@ def test_what_says_more_is_not_replaced(tmp_path, monkeypatch):
         return read_record(path)
 
     first = submitted("a", TEST)
-    with pytest.raises(ValueError, match=r"to must not hold a record that says more; .*homogeneous.* lose its episodes "
-                                         "test:1$"):
+    with pytest.raises(ValueError, match=r"to must not hold a record with other episodes; .*homogeneous.* lose its "
+                                         "episodes test:1$"):
         submitted("b", TEST[:1], official=True)
     assert read_records(to) == [first]
     first = submitted("a", TEST, official=True)
-    with pytest.raises(ValueError, match=r"to must not hold a record that says more; .* lose its being official$"):
+    with pytest.raises(ValueError, match=r"to must not hold an official record; .* lose its official status$"):
         submitted("c", TEST)
-    assert read_records(to) == [first] and not (tmp_path / "c").exists()               # it is said before it is played
+    assert read_records(to) == [first] and not (tmp_path / "c").exists()               # the error precedes all runs
     path = write_record(to, first | {"runs": [run | {"commit": "decaf"} for run in first["runs"]]})
-    with pytest.raises(ValueError, match="would lose its being official"):
+    with pytest.raises(ValueError, match="would lose its official status"):
         submitted("b", TEST[:1])
     with monkeypatch.context() as patch:
         patch.setattr(methods, "golden_version", lambda name: 2)
@@ -153,7 +153,7 @@ def test_what_says_more_is_not_replaced(tmp_path, monkeypatch):
 
 
 def test_a_record_of_another_scoring_is_extended(tmp_path, monkeypatch):
-    """Its episodes are neither run again nor lost, and each run names its own version of scoring."""
+    """Its episodes are neither rerun nor lost, and each run has its version of scoring."""
     to = tmp_path / "to"
     (path,) = submit("homogeneous", [FILTER.id], TEST[:1], EpisodeStore(tmp_path / "a"), to)
     first = read_record(path)
@@ -169,7 +169,7 @@ def test_a_record_of_another_scoring_is_extended(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("official", [False, True])
 def test_a_record_is_extended(official, tmp_path):
-    """By what another folder's run plays beside it: what is in the record is neither played again nor lost."""
+    """Episodes run in another folder are added; episodes of the record are neither rerun nor lost."""
     log, to = tmp_path / "log", tmp_path / "to"
     mine = write_baseline(tmp_path, init=counting(log))
 
@@ -187,8 +187,8 @@ def test_a_record_is_extended(official, tmp_path):
     assert submitted("c", "test:9-10") == both and count(log) == 2
 
 
-def test_a_result_that_no_record_may_hold_is_not_submitted(tmp_path, monkeypatch):
-    """It is named, and nothing is written."""
+def test_invalid_results_are_not_submitted(tmp_path, monkeypatch):
+    """The message has the method, and nothing is written."""
     monkeypatch.setattr(run, "compute_scores", lambda *asked, compute=run.compute_scores: (
         compute(*asked) | {"seconds_per_step": -1.0}))
     with pytest.warns(UserWarning, match=r"homogeneous/test-0\.json is left out: it is not valid: .*seconds_per_step"):
@@ -198,8 +198,8 @@ def test_a_result_that_no_record_may_hold_is_not_submitted(tmp_path, monkeypatch
     assert not (tmp_path / "leaderboards").exists()
 
 
-def test_from_a_file_to_the_boards_by_command(tmp_path):
-    """submit, leaderboard and compare, as README says."""
+def test_from_a_file_to_the_leaderboards_by_command(tmp_path):
+    """The commands submit, leaderboard and compare work as README describes."""
     write_baseline(tmp_path)
     common = ("--env", FILTER.id, "--seeds", "test:0-6", "-j", "1")
     code, said, _ = eitbench("submit", "--baseline", "mine.py", *common)

@@ -1,4 +1,4 @@
-"""Verification: honest records agree; changed numbers, other files, caches and memorised episodes are found."""
+"""Verification: valid records agree; changed numbers, other files, caches and memorised episodes are detected."""
 
 import hashlib
 import json
@@ -33,7 +33,7 @@ confined = pytest.mark.skipif(bool(bubblewrap_problem()), reason=bubblewrap_prob
 
 @pytest.fixture(autouse=True)
 def tiny_world(monkeypatch, tmp_path):
-    """The registered environments run tiny worlds, in an empty folder."""
+    """Use tiny worlds for the registered ids, and an empty folder."""
     git_says(monkeypatch)
     shorten(monkeypatch, {FILTER.id: SCENARIO, INJECTION: PIPE, CURRENTS: PIPE})
     monkeypatch.setattr(held_out, "COMMITMENT", tmp_path / "held_out.json")
@@ -43,7 +43,7 @@ def tiny_world(monkeypatch, tmp_path):
 
 
 def submitted(method, seeds="test:0", env=FILTER.id, kind="--baseline"):
-    """The path of a record that is made as README says."""
+    """Return the path of a record made as README describes."""
     code, said, complaint = eitbench("submit", kind, method, "--env", env, *HERE, "--to", "board/results",
                                      "--seeds", seeds)
     assert code == 0, complaint
@@ -51,7 +51,7 @@ def submitted(method, seeds="test:0", env=FILTER.id, kind="--baseline"):
 
 
 def changed(path, change, to="forged/results"):
-    """The record with a changed content and the digest that goes with it."""
+    """Write the record with changed content and a matching digest."""
     record = json.loads(path.read_text())
     change(record)
     return write_record(Path(to), record)
@@ -78,8 +78,8 @@ def mine(tmp_path):
 # -- reruns -------------------------------------------------------------------------------------
 
 
-def test_an_honest_record_agrees(mine):
-    """Of episodes that are simulated again, drawn by the seed; the output is a Markdown table."""
+def test_a_valid_record_agrees(mine):
+    """Episodes are simulated again and chosen by the seed; the output is a Markdown table."""
     path = submitted(mine, "test:0-3")
     command = ("verify", path, "--method", mine, "--episodes", 2, "--seed", 5, *HERE)
     code, said, complaint = eitbench(*command)
@@ -93,7 +93,7 @@ def test_an_honest_record_agrees(mine):
 
 @confined
 def test_a_third_party_file_runs_under_bubblewrap(mine):
-    """It is found by its sha256 beside the records, as a pull request has it."""
+    """The file is found by its sha256 in the folder methods, as in a pull request."""
     path = submitted(mine)
     place = Path("board/methods/somebody")
     place.mkdir(parents=True)
@@ -104,7 +104,7 @@ def test_a_third_party_file_runs_under_bubblewrap(mine):
 
 
 def test_built_in_methods_are_known_by_name(tmp_path):
-    """Policies, privileged ones and failures too; the arguments are those of the record."""
+    """Policies, privileged methods and failures are verified too, with the arguments of the record."""
     for name in ("random_pair", "clairvoyant"):
         assert eitbench("run", "--env", INJECTION, "--policy", name, "--seeds", "dev:0", "--estimator", "reduced",
                         "-j", 1)[0] == 0
@@ -137,25 +137,25 @@ def redistributed(record):
     (better, r"test:0: \w+ differs by 0\.1"), (other("nis", 1.0), "nis differs by"),
     (other("crps", None), "crps differs"), (redistributed, "step_errors differs"), (failed, "status is ok"),
     (lambda record: record.update(title="Theirs"), "title is 'Mine', but 'Theirs' in the record"),
-    (other("seconds_per_step", 1e-9), ""),                              # a clock proves nothing
-    (lambda record: record["episodes"][0]["scores"].pop("nis"), ""),    # made before that score existed
+    (other("seconds_per_step", 1e-9), ""),                              # times are not compared
+    (lambda record: record["episodes"][0]["scores"].pop("nis"), ""),    # a record from before that score
 ], ids=["better", "score", "missing", "steps", "failed", "title", "time", "older"])
 def test_changed_numbers_are_found(change, message, mine):
-    """Also with the digest that goes with them."""
+    """The digest matches the changed content."""
     path = changed(submitted(mine), change)
     code, said, complaint = eitbench("verify", path, "--method", mine, *HERE)
     assert code == bool(message) and re.search(message, complaint) and (AGREE in said) != bool(message)
 
 
 def test_the_tolerance_is_relative(mine):
-    """1e-4 agrees within 1e-3."""
+    """A difference of 1e-4 is within a tolerance of 1e-3."""
     path = changed(submitted(mine), lambda record: better(record, 1.0 + 1e-4))
     for tolerance, code in (([], 1), (["--tolerance", "1e-3"], 0), (["--tolerance", "5e-5"], 1)):
         assert eitbench("verify", path, "--method", mine, *HERE, *tolerance)[0] == code
 
 
 def test_another_file_does_not_run(mine, tmp_path):
-    """Its scores would say nothing about the record; nor may a link to a built-in file take its place."""
+    """Its scores would not verify the record; a link to a built-in file is rejected too."""
     path = submitted(mine)
     another = write_baseline(tmp_path / "another", update=f"open({str(tmp_path / 'ran')!r}, 'w')")
     code, _, complaint = eitbench("verify", path, "--method", another, *HERE)
@@ -163,12 +163,12 @@ def test_another_file_does_not_run(mine, tmp_path):
     link = tmp_path / "link" / "mine.py"
     link.parent.mkdir()
     link.symlink_to(methods.find_method("homogeneous", "estimation"))
-    with pytest.raises(ValueError, match="is a built-in method, but not mine"):
+    with pytest.raises(ValueError, match="must be the method of the record, mine, got another built-in"):
         verification.job_for_record(read_record(path), str(link))
 
 
-def test_numbers_decide_and_not_the_text(monkeypatch):
-    """A built-in method's record may have other words; a record of an older version is noted, a newer one is wrong."""
+def test_only_numbers_of_built_in_methods_are_compared(monkeypatch):
+    """A built-in method's record may differ in texts; a record of an older version has a note, a newer one is wrong."""
     path = submitted("homogeneous")
 
     def reworded(record):
@@ -176,7 +176,7 @@ def test_numbers_decide_and_not_the_text(monkeypatch):
 
     assert eitbench("verify", changed(path, reworded), "-j", 1)[0] == 0
     code, _, complaint = eitbench("verify", changed(path, lambda record: record.update(role=None)), "-j", 1)
-    assert code == 1 and "role is 'floor', but None in the record" in complaint
+    assert code == 1 and "but None in the record" in complaint
     newer = changed(path, lambda record: record.update(version="v9"))
     code, _, complaint = eitbench("verify", newer, "-j", 1)
     assert code == 1 and "the record is of v9, but homogeneous is v1" in complaint
@@ -186,7 +186,7 @@ def test_numbers_decide_and_not_the_text(monkeypatch):
 
 
 def test_the_cache_is_not_used(mine, tmp_path, monkeypatch):
-    """A cache in which test:0 is another, easier episode makes a better score, but no record that agrees."""
+    """A score from a cache in which test:0 is another, easier episode does not agree."""
     monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path / "cache"))
     world, seed = PIPE_2D.with_changes(SCENARIO), parse_seeds("test:0")[0]
     honest = simulate(world, seed, progress=False)
@@ -203,11 +203,11 @@ def test_the_cache_is_not_used(mine, tmp_path, monkeypatch):
 # -- many records -------------------------------------------------------------------------------
 
 
-def test_all_official_records_are_verified_and_a_false_one_is_named(monkeypatch):
-    """Once: the same command resumes. Damaged files are named before anything runs."""
+def test_all_official_records_are_verified_and_a_false_one_is_reported(monkeypatch):
+    """A repeated command resumes. Damaged files are reported before any episode is run."""
     for path in (submitted("homogeneous", "test:0-2"), submitted("random_pair", "test:0-2", INJECTION, "--policy")):
         changed(path, official)
-    changed(submitted("persistence", "test:0-2"), lambda record: None)               # self-reported: not asked
+    changed(submitted("persistence", "test:0-2"), lambda record: None)               # self-reported: not verified
     command = ("verify", "--all", "--records", "forged/results", "--out", "again", "--episodes", 2, "-j", 1)
     code, said, complaint = eitbench(*command)
     assert code == 0 and "2 of 2 records agree" in said and "persistence" not in said, complaint
@@ -223,7 +223,7 @@ def test_all_official_records_are_verified_and_a_false_one_is_named(monkeypatch)
 
 
 def test_the_first_records_of_a_board_are_chosen(mine):
-    """By mean error, self-reported ones too, without naive baselines."""
+    """Records are chosen by mean error, including self-reported ones, without naive baselines."""
     naive, own = submitted("homogeneous"), submitted(mine)
     second = changed(own, lambda record: (better(record, 1.1), record.update(
         version="1" * 8, method_sha256="1" * 64)), own.parent)
@@ -251,7 +251,7 @@ class Policy:
 
 @pytest.mark.parametrize("env", [INJECTION, CURRENTS])
 def test_recorded_actions_are_replayed_without_the_policy(env, monkeypatch):
-    """Pairs and currents; with other actions the scores are others, and an action that is missing is named."""
+    """For pairs and currents, other actions give other scores, and a missing action is reported."""
     Path("drawn.py").write_text(DRAWN)
     path = submitted("random_pair" if env == INJECTION else "drawn.py", env=env, kind="--policy")
     record = read_record(path)
@@ -269,7 +269,7 @@ def test_recorded_actions_are_replayed_without_the_policy(env, monkeypatch):
         actions[0], actions[1] = actions[1], actions[0]
 
     assert eitbench("verify", changed(path, other_first), "--replay", "-j", 1)[0] == 1
-    for change, message in ((lambda record: record["episodes"][0]["actions"].pop(), "as many as"),
+    for change, message in ((lambda record: record["episodes"][0]["actions"].pop(), "must have one entry"),
                             (lambda record: record["episodes"][0].pop("actions"), "has no recorded actions")):
         code, _, complaint = eitbench("verify", changed(path, change), "--replay", "-j", 1)
         assert code == 1 and message in complaint
@@ -287,7 +287,7 @@ def write_secret(secret=SECRET, mode=0o600):
 
 
 def test_held_out_seeds_are_the_formula():
-    """SHA-256 of secret and number, outside the public splits; the commitment of the leaderboards is a hash."""
+    """The seeds are SHA-256 of secret and number, outside the public splits; the commitment is a hash."""
     seeds = held_out_seeds(SECRET, 50)
     assert seeds[1] == int(hashlib.sha256(SECRET + bytes(7) + b"\1").hexdigest(), 16) % 2**63
     assert len(set(seeds)) == 50 and max(split.stop for split in SPLITS.values()) <= min(seeds) < max(seeds) < 2**63
@@ -295,8 +295,8 @@ def test_held_out_seeds_are_the_formula():
     assert re.fullmatch("[0-9a-f]{64}", json.loads(published.read_text())["salt_sha256"])
 
 
-def test_a_secret_is_its_owners_and_committed():
-    """A file that others cannot read, whose hash was published before."""
+def test_a_secret_is_private_and_committed():
+    """The secret is a private file, and its hash is committed."""
     assert read_secret(write_secret()) == SECRET
     for secret, mode, message in ((bytes(32), 0o600, "commits to"), (SECRET, 0o640, "by its owner only"),
                                   (b"short", 0o600, "must have 32 bytes, got 5")):
@@ -310,9 +310,9 @@ def test_a_secret_is_its_owners_and_committed():
 
 
 @pytest.mark.parametrize(("gain", "low", "high"), [(0.0, 0.02, 0.08), (0.3, 0.6, 1.0), (-0.3, 0.0, 0.01)])
-def test_the_test_rejects_what_it_should(gain, low, high):
-    """300 records of ten episodes, with 30 held-out: honest ones in 5 % of cases, those that are 30 % better on public
-    episodes mostly, those that are worse never."""
+def test_error_rates_of_the_held_out_test(gain, low, high):
+    """Rejection rates of 300 records of ten episodes, with 30 held-out ones: 5 % of valid records, most records that
+    are 30 % better on public episodes, and none that are worse."""
     random = np.random.default_rng(7)
     rejected = [p_value(random.normal(np.log1p(-gain), 0.3, 10), random.normal(0.0, 0.3, 30), 399) < 0.05
                 for _ in range(300)]
@@ -320,7 +320,7 @@ def test_the_test_rejects_what_it_should(gain, low, high):
 
 
 @confined
-def test_held_out_episodes_tell_the_honest_from_the_prepared(mine, monkeypatch):
+def test_held_out_episodes_detect_memorised_ones(mine, monkeypatch):
     """Seeds and secret are neither printed nor passed to the worker; third-party files need bubblewrap."""
     public = submitted(mine, "test:0-7")
     claim = ("--episodes", 0, "--held-out", 6, "--secret", write_secret(), "--method", mine, "-j", 1)
@@ -340,8 +340,8 @@ def test_held_out_episodes_tell_the_honest_from_the_prepared(mine, monkeypatch):
     assert code == 1 and "must run under bubblewrap on held-out episodes" in complaint
 
 
-def test_no_record_of_the_baseline_counts():
-    """The naive baseline is run here, on both kinds of episodes: compared with itself it is never better."""
+def test_records_of_the_baseline_are_not_used():
+    """The naive baseline is run on both kinds of episodes: compared with itself it is never better."""
     path = submitted("homogeneous", "test:0-5")
     row, problems = held_out.verify_held_out(read_record(path), Job(FILTER._replace(kwargs="{}"), "homogeneous", 0),
                                              SECRET, 4)
@@ -363,7 +363,7 @@ def test_no_record_of_the_baseline_counts():
     (["r.json", "--held-out", "3", "--secret", "none"], "must be a file of hexadecimal digits"),
 ])
 def test_mistakes_are_explained(arguments, message):
-    """Exit status 2, unlike that of a false record."""
+    """Exit status 2, different from an invalid record."""
     code, said, complaint = eitbench("verify", *arguments)
     assert code == 2 and said == "" and message in complaint
     code, _, complaint = eitbench("verify", "record.json")
@@ -371,7 +371,7 @@ def test_mistakes_are_explained(arguments, message):
 
 
 def test_the_workflow_calls_an_existing_command():
-    """Its options are those of `verify`."""
+    """The options of the workflow exist in `verify`."""
     text = (Path(held_out.__file__).parents[2] / ".github/workflows/submission.yml").read_text()
     (call,) = re.findall(r"bin/eitbench (verify .*?)(?: >|\n)", text)
     options = re.findall(r"--[a-z-]+", call)

@@ -1,4 +1,4 @@
-"""The command line, as a newcomer uses it: what it runs, what it writes, and what it says of mistakes."""
+"""Command line: runs, written files and error messages."""
 
 import json
 import re
@@ -28,7 +28,7 @@ COMMANDS = ("list", "run", "bank", "train", "submit", "verify", "golden",
             "fit", "estimate", "export", "leaderboard", "compare", "render")
 TINY = {"flow": {"mean_velocity": 45.0}, "schedule": {"scored_steps": 3, "pattern": {"frame": 2}},
         "vessel": {"electrodes_per_wall": 2}}
-"""A fast fluid flushes the pipe in two steps: an episode of five takes a third of a second."""
+"""A fast flow with a residence time of two steps: an episode of five takes a third of a second."""
 
 MINE = '''"""My method: the expected level everywhere."""
 import numpy as np
@@ -45,7 +45,7 @@ class Estimator:
 
 @pytest.fixture(autouse=True)
 def tiny_world(monkeypatch, tmp_path):
-    """The registered environments play tiny worlds, in an empty folder; git is left alone."""
+    """Use tiny worlds for the registered ids, an empty folder, and no git."""
     git_says(monkeypatch)
     shorten(monkeypatch, {name: TINY if name in PLAIN else world(name)["world"] for name in ids()})
     lagged = replace(entry("eitbench/Pipe2DFixedLag-v0"), settings={"lag": 2})
@@ -55,15 +55,15 @@ def tiny_world(monkeypatch, tmp_path):
 
 
 def run_mine(*more):
-    """`eitbench run` of the file mine.py on the first board."""
+    """Run `eitbench run` with the file mine.py in the filtering environment."""
     return eitbench("run", "--env", PIPE, "--baseline", "mine.py", "--seeds", "dev:0-1", "-j", "1", *more)
 
 
 # -- run and leaderboard ----------------------------------------------------------------------------------------------
 
 
-def test_ten_lines_of_ones_own_get_a_table_and_a_page(tmp_path):
-    """A user's file is run, scored and shown beside ours: on the terminal, as Markdown, HTML and JSON."""
+def test_a_users_file_has_a_table_and_a_page(tmp_path):
+    """A user's file is run, scored and shown next to built-in methods: on the terminal, as Markdown, HTML and JSON."""
     assert len(MINE.splitlines()) <= 10
     code, said, _ = run_mine("--baseline", "homogeneous")
     assert code == 0 and "| mine " in said and "| homogeneous " in said
@@ -78,7 +78,7 @@ def test_ten_lines_of_ones_own_get_a_table_and_a_page(tmp_path):
     assert all(episode["status"] == "ok" for episode in record["episodes"])
 
 
-def test_leaderboard_writes_the_same_again(tmp_path):
+def test_leaderboard_is_reproducible(tmp_path):
     """`leaderboard` needs only the stored episodes."""
     _, said, _ = run_mine("-o", "mine/results")
     folder = tmp_path / "mine" / "results"
@@ -89,8 +89,8 @@ def test_leaderboard_writes_the_same_again(tmp_path):
     assert (folder / "leaderboard.md").read_bytes() == table and (folder / "index.html").exists()
 
 
-def test_every_board_by_default(tmp_path):
-    """Without --env a baseline plays every environment of the quick suite that is of its boards."""
+def test_every_subtrack_by_default(tmp_path):
+    """Without --env an estimator runs in every environment of the quick suite of its subtracks."""
     (tmp_path / "mine.py").write_text(MINE.replace("class Estimator:", "class Estimator:\n"
                                                    "    subtracks = ('filter', 'fixed-lag', 'smoothing')"))
     code, said, _ = eitbench("run", "--baseline", "mine.py", "--seeds", "dev:0", "-j", "1")
@@ -99,8 +99,8 @@ def test_every_board_by_default(tmp_path):
 
 
 def test_suites():
-    """full is every environment; quick the plain pipe on fewer seeds, but for the one method that takes minutes.
-    What was learned in a real pipe plays no tiny one."""
+    """full has every environment; quick the plain pipe with fewer seeds, without the method that takes minutes. Methods
+    fitted to a real pipe are incompatible with tiny worlds."""
     quick, full = (suites.make_jobs("estimation", [], [], [1], suite=suite) for suite in ("quick", "full"))
     plain = set(PLAIN) & set(ids("estimation"))
     assert {job.environment.id for job in quick} == plain and len(plain) == 3
@@ -120,7 +120,7 @@ def test_suites():
 
 
 def test_list():
-    """Every environment with its board, every baseline and policy with its boards and title."""
+    """The list has every environment with its subtrack, and every method with its subtracks and title."""
     code, said, _ = eitbench("list")
     assert code == 0
     lines = {line.split()[0]: line for line in said.splitlines()}
@@ -136,7 +136,7 @@ def test_list():
 @pytest.mark.parametrize("command", ["", *COMMANDS])
 @pytest.mark.parametrize("flag", ["--help", "-h"])
 def test_help(command, flag):
-    """Each command explains itself."""
+    """Each command has a help text."""
     code, said, _ = eitbench(*filter(None, [command, flag]))
     assert code == 0 and "Usage" in said
     if not command:
@@ -144,7 +144,7 @@ def test_help(command, flag):
 
 
 def test_every_option_has_a_help():
-    """And every argument, and every command."""
+    """All commands, arguments and options have help texts."""
     commands = get_command(app).commands
     shown = {name: command for name, command in commands.items() if not command.hidden}
     assert shown.keys() == set(COMMANDS)
@@ -155,13 +155,12 @@ def test_every_option_has_a_help():
 
 
 def test_version():
-    """That of the installed package."""
+    """The version is the version of the installed package."""
     assert eitbench("--version")[:2] == (0, f"eitbench {__version__}\n")
 
 
 def test_documented_commands_are_commands():
-    """Every `eitbench …` of our documents, on a line of its own or within one, names a command and options that exist;
-    so says their help."""
+    """Every `eitbench …` in the documents names a command and options that exist, according to their help."""
     named, helps = dict[str, set[str]](), dict[str, str]()
     for path in (ROOT / "README.md", ROOT / "leaderboards" / "README.md", *(ROOT / "docs").glob("*.md")):
         text = path.read_text(encoding="utf-8").replace("\\\n", "")
@@ -178,13 +177,13 @@ def test_documented_commands_are_commands():
         assert all(re.search(rf"{option}\b", helps[command]) for option in options), (command, options)
 
 
-# -- mistakes ---------------------------------------------------------------------------------------------------------
+# -- errors -----------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(("arguments", "message"), [
     (["run", "--seeds", "exam:1"], "seeds must name one of the splits train, dev, test, got 'exam:1'"),
     (["run", "--seeds", "dev:1-"], "seeds must look like 'test:0-4'"),
-    (["run", "--seeds", "0-3"], "seeds must say of which split: train:0-3, dev:0-3 or test:0-3; got '0-3'"),
+    (["run", "--seeds", "0-3"], "seeds must have a split: train:0-3, dev:0-3 or test:0-3; got '0-3'"),
     (["run", "--env", "eitbench/pip2D-v0"], "Did you mean eitbench/Pipe2D-v0?"),
     (["run", "--baseline", "kalman_fliter"], "Did you mean kalman_filter?"),
     (["run", "--set", "instrument.noise_relativ=0.1"], "Did you mean noise_relative?"),
@@ -195,9 +194,9 @@ def test_documented_commands_are_commands():
     (["run", "--baseline", "broken.py"], "broken.py"),
     (["run", "--baseline", "mine.py", "--env", "eitbench/Pipe2DSmoothing-v0"],
      "baseline mine.py suits none of the environments"),
-    (["leaderboard", "-o", "nothing"], "no results in nothing; make some with `eitbench run`"),
+    (["leaderboard", "-o", "nothing"], "no results in nothing; create some with `eitbench run`"),
     (["render", "--step", "3"], "out must end in .png with step"),
-    (["render", "--baseline", "fixed_interval_smoother"], "plays smoothing, but eitbench/Pipe2D-v0 is a filter"),
+    (["render", "--baseline", "fixed_interval_smoother"], "smoothing, but eitbench/Pipe2D-v0 is a filter"),
     (["render", "--env", INJECTION], f"policy must be given for {INJECTION}"),
     (["render", "--env", INJECTION, "--policy", "random_pair", "--step", "1", "-o", "a.png"],
      "step must be an integer of at least 3 and at most 5, got 1"),
@@ -209,7 +208,7 @@ def test_documented_commands_are_commands():
     (["rnu"], "No such command"),
 ])
 def test_mistakes_are_explained(arguments, message, tmp_path):
-    """Exit code 2 and a sentence that names the argument; no traceback, and nothing is written."""
+    """Exit code 2 and a sentence with the argument; no traceback, and no file is written."""
     (tmp_path / "empty.py").write_text("")
     (tmp_path / "broken.py").write_text("class Estimator(:")
     (tmp_path / "other").mkdir()
@@ -221,16 +220,16 @@ def test_mistakes_are_explained(arguments, message, tmp_path):
 
 
 @pytest.mark.parametrize(("given", "isolate"), [([], "auto"), (["--isolate", "process"], "process")])
-def test_an_episode_is_drawn_as_isolated_as_asked(given, isolate, monkeypatch):
-    """As by all other commands that play."""
+def test_render_isolates_methods(given, isolate, monkeypatch):
+    """The command has the same isolation as all commands that run methods."""
     asked = []
     monkeypatch.setattr(animate, "animate", lambda *_, **how: asked.append(how["isolate"]))
     code, _, complaint = eitbench("render", *given)
     assert code == 0 and asked == [isolate], complaint
 
 
-def test_a_missing_extra_is_named(monkeypatch, tmp_path):
-    """Without what a recipe is read by, exit code 1 and the name of what to install."""
+def test_a_missing_extra_is_reported(monkeypatch, tmp_path):
+    """Without a reader of configurations: exit code 1 and the name of the extra."""
     monkeypatch.setitem(sys.modules, "yaml", None)
     code, said, complaint = eitbench("train", "--env", INJECTION)
     assert code == 1 and said == "" and "needs the extra bench, pip install 'eitbench[bench]'" in complaint
@@ -238,11 +237,11 @@ def test_a_missing_extra_is_named(monkeypatch, tmp_path):
 
 
 def test_same_command_resumes(tmp_path):
-    """The second time nothing is played; one seed more is one episode more."""
+    """The second command runs nothing; one more seed is one more episode."""
     assert run_mine()[0] == 0
     before = sorted(path.stat().st_mtime_ns for path in (tmp_path / "results" / "episodes").rglob("*.json"))
     _, said, complaint = run_mine()
-    assert "2 of 2 episodes are already there" in said + complaint
+    assert "2 of 2 episodes are already stored" in said + complaint
     run_mine("--seeds", "dev:0-2")
     after = sorted(path.stat().st_mtime_ns for path in (tmp_path / "results" / "episodes").rglob("*.json"))
     assert len(before) == 2 and len(after) == 3 and after[:2] == before

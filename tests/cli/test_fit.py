@@ -1,5 +1,4 @@
-"""`eitbench fit prior`, `fit model`: what they write is what filters read, and they learn from training episodes
-alone."""
+"""`eitbench fit prior`, `fit model`: filters can read the files, and only training episodes are used."""
 
 import json
 
@@ -25,7 +24,7 @@ def test_writes_what_filters_read(tmp_path):
 @pytest.mark.parametrize("name", ["pipe2d-linear", "pipe2d-logarithm", "pipe2dintermittent-linear",
                                   "pipe2dintermittent-logarithm"])
 def test_shipped_priors_are_what_the_command_writes(tmp_path, name):
-    """With the source that they name, to nine digits."""
+    """The source in the file reproduces it to nine digits."""
     shipped = InflowPrior.load(baseline_folder() / "priors" / f"{name}.json")
     source = shipped.source
     quiet = ["--quiet", source["quiet"]] if "quiet" in source else []
@@ -39,13 +38,13 @@ def test_shipped_priors_are_what_the_command_writes(tmp_path, name):
     assert again.regimes == shipped.regimes
 
 
-@pytest.mark.parametrize("arguments, said", [
+@pytest.mark.parametrize("arguments, message", [
     (["--env", "eitbench/Pipe2D-v0", "--seeds", "test:0-3"], "seeds must be of the split train"),
     (["--env", "eitbench/RotatingTank2D-v0"], "target must have an inflow"),
     (["--env", "eitbench/Nowhere-v0"], "env must be one of"),
 ])
 @pytest.mark.parametrize("command", ["prior", "model"])
-def test_mistakes_are_told_before_anything_is_written(tmp_path, command, arguments, said):
+def test_errors_precede_all_writing(tmp_path, command, arguments, message):
     code, _, err = eitbench("fit", command, *arguments, "--out", tmp_path / "mine")
-    assert code == 2 and said in err
+    assert code == 2 and message in err
     assert not (tmp_path / "mine").exists()

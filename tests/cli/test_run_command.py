@@ -1,4 +1,4 @@
-"""`eitbench run` for somebody whose method does not work yet, and for somebody who asks how far one carries."""
+"""`eitbench run`: failures of a user's method, requested tables and sweeps."""
 
 import re
 
@@ -17,7 +17,7 @@ HELPER = "import numpy as np; print('one', end=' '); print('\\x1b[31mtwo'); np.l
 
 @pytest.fixture(autouse=True)
 def tiny_world(monkeypatch, tmp_path):
-    """A world of five steps, in an empty folder; 80 columns."""
+    """Use a world of five steps, in an empty folder; 80 columns."""
     git_says(monkeypatch)
     monkeypatch.setenv("COLUMNS", "80")
     shorten(monkeypatch, {PIPE: SCENARIO})
@@ -25,7 +25,7 @@ def tiny_world(monkeypatch, tmp_path):
 
 
 def run(*arguments, command="run"):
-    """Exit code, standard output, standard error."""
+    """Return exit code, standard output, standard error."""
     done = CliRunner().invoke(app, [command, "--env", PIPE, "--seeds", "dev:0-1", "-j", "1", *arguments])
     if done.exception is not None and not isinstance(done.exception, SystemExit):
         raise done.exception                                           # a user would see a traceback
@@ -33,9 +33,9 @@ def run(*arguments, command="run"):
 
 
 @pytest.mark.parametrize("isolate", ["process", "none"])
-def test_a_failure_names_the_users_own_lines(isolate, tmp_path):
-    """File, line and function, here as on the page, in either process; none of eitbench, none of numpy. The output of
-    another process is marked and cleaned. Nothing was finished: exit status 1."""
+def test_a_failure_shows_the_users_lines(isolate, tmp_path):
+    """Terminal and page show file, line and function of the user's file without stack frames of eitbench and numpy, for
+    both kinds of isolation. Output of another process is prefixed and sanitised. Exit status 1 as all failed."""
     write_baseline(tmp_path, "bad", update=HELPER)
     code, _, complaint = run("--baseline", "bad.py", "--isolate", isolate)
     printed = "[bad] one \\x1b[31mtwo\n" if isolate == "process" else "one \x1b[31mtwo\n"
@@ -44,7 +44,7 @@ def test_a_failure_names_the_users_own_lines(isolate, tmp_path):
     failure = complaint[complaint.index("failed:"):]
     assert failure.startswith(f"failed: bad in {PIPE} on dev:0-1: LinAlgError: Singular matrix\n"
                               f'    File "bad.py", line {line}, in update\n      import numpy as np; print(')
-    assert failure.count("File ") == 1 and "no episode was finished by bad" in failure
+    assert failure.count("File ") == 1 and "all episodes failed for bad" in failure
     hint = f"--baseline {tmp_path / 'bad.py'} --seeds dev:0 --isolate none --jobs 1"
     assert hint in failure
     page = (tmp_path / "results" / "index.html").read_text(encoding="utf-8")
@@ -53,15 +53,15 @@ def test_a_failure_names_the_users_own_lines(isolate, tmp_path):
     assert f"bad.py:{line}" in record.read_text() and "traceback" not in record.read_text()
 
 
-def test_only_a_method_that_finished_nothing_is_an_error(tmp_path):
-    """One episode is enough, and who did not finish any is named, beside others that did."""
+def test_only_a_method_without_finished_episodes_is_an_error(tmp_path):
+    """One finished episode is enough; only a method without any is reported."""
     write_baseline(tmp_path, "sometimes", init="assert not Path(folder := 'there').exists(); Path(folder).mkdir()")
     write_baseline(tmp_path, "never", init="raise KeyError('x')")
     write_baseline(tmp_path, "always")
     given = ["--isolate", "none", *(word for name in ("sometimes", "never", "always")
                                      for word in ("--baseline", f"{name}.py"))]
     code, said, complaint = run(*given)
-    assert code == 1 and "no episode was finished by never\n" in complaint
+    assert code == 1 and "all episodes failed for never\n" in complaint
     assert "dev:0-1, 1 failed" in said and "dev:0-1, 2 failed" in said
     assert run(*given[:4])[0] == 0
 
@@ -73,8 +73,8 @@ def test_a_file_that_cannot_be_executed_says_where(tmp_path):
         assert code == 2 and "(broken.py:3)" in re.sub(r"[│\s]+", " ", complaint)
 
 
-def test_the_table_is_of_what_was_asked_and_fits(tmp_path):
-    """Whatever else the folder holds; 80 columns or those of the terminal; every skill is a number."""
+def test_the_table_has_the_requested_results_and_fits(tmp_path):
+    """Other results in the folder are not shown; 80 columns or the width of the terminal; every score is a number."""
     for name in ("first", "second_" + 40 * "x"):
         write_baseline(tmp_path, name, update="return Estimate(self.level, np.ones_like(self.level))")
     run("--baseline", "first.py", "--isolate", "none")
@@ -87,7 +87,7 @@ def test_the_table_is_of_what_was_asked_and_fits(tmp_path):
 
 
 def test_a_sweep_has_a_table_and_a_chart(tmp_path):
-    """A column for each value, by size; each variant is stored under a name of its own, and the page shows it."""
+    """There is a column for each value, sorted; each variant has a separate name, and the page shows the sweep."""
     code, said, complaint = run("--baseline", "homogeneous", "--set", "instrument.noise_relative=0.3,0.01")
     assert code == 0, complaint
     assert "ẽ_c for instrument.noise_relative =" in said
@@ -109,7 +109,7 @@ def test_a_sweep_has_a_table_and_a_chart(tmp_path):
     (["a.b=1,2", "c=3,4"], [{"a": {"b": i}, "c": j} for i in (1, 2) for j in (3, 4)]),
 ])
 def test_variants(settings, worlds):
-    """Words become what `world=` takes; one number that differs is swept, two are not."""
+    """Settings are converted to the argument `world`; one number with several values is swept, two are not."""
     assert variants(settings) == worlds
     differ = {key for key in flatten(worlds[0]) if len({str(flatten(world)[key]) for world in worlds}) > 1}
     assert swept_parameter(worlds) == (differ.pop() if len(differ) == 1 else None)
@@ -124,12 +124,12 @@ def test_variants(settings, worlds):
     (["a.b=1", "a.b=2"], "set must name each number once, got 'a.b' again"),
     (["a.b=1", "a=2"], "set must name each number once, got 'a' again"),
 ])
-def test_settings_that_are_none(settings, message):
+def test_invalid_settings(settings, message):
     with pytest.raises(ValueError, match=re.escape(message)):
         variants(settings)
 
 
-def test_what_a_world_has_not_is_told(tmp_path):
-    """Before anything is played or written."""
+def test_unknown_settings_of_a_world_are_reported(tmp_path):
+    """The error precedes all runs and writing."""
     code, _, complaint = run("--set", "instrument.noise=0.02")
     assert code == 2 and "noise_relative" in complaint and not (tmp_path / "results").exists()

@@ -144,10 +144,10 @@ def test_command_fills_and_resumes(place, asked, alone):
     """The command prints the numbers of new and cached episodes, and environments find them; dev:0 is not train:0."""
     code, said, _ = command("bank", "--seeds", "train:0-2", "-j", "1")
     assert code == 0
-    assert "3 simulated, 0 were there" in said
+    assert "3 simulated, 0 were already stored" in said
     assert f"3 episodes, 0 MB in {place}" in said
     code, said, _ = command("bank", "--seeds", "train:0-3", "-j", "1", "--env", "eitbench/Pipe2DSmoothing-v0")
-    assert code == 0 and "1 simulated, 3 were there" in said and asked == [[0, 1, 2], [3]]
+    assert code == 0 and "1 simulated, 3 were already stored" in said and asked == [[0, 1, 2], [3]]
     assert {seed: cached_episode(TINY, seed).tobytes() for seed in range(4)} == {seed: alone[seed] for seed in range(4)}
     assert command("bank", "--seeds", "dev:0", "-j", "1")[0] == 0 and asked[2:] == [[100_000]]
 

@@ -42,7 +42,7 @@ def test_leaderboard_scores_what_is_rewarded(name, said, monkeypatch):
 
 
 @pytest.mark.parametrize(("id", "message"), [
-    (PIPE, "Estimate.velocity must be None where the flow is not asked"),
+    (PIPE, "Estimate.velocity must be None where the flow is not estimated"),
     (SKEWED, r"Estimate.velocity must have shape \(3,\)"),
 ])
 def test_flow_is_refused_where_it_is_not_asked_for(id, message):

@@ -1,4 +1,4 @@
-"""Training with stable-baselines3: agents learn from what the environments show, and no result is lost."""
+"""Training with stable-baselines3: agents learn from the environments, and interrupted runs resume."""
 
 import json
 from dataclasses import asdict, replace
@@ -23,7 +23,7 @@ from short import merged
 NAME = "eitbench/Pipe2DInjection-v0"
 CURRENTS, BUDGET = "eitbench/Pipe2DInjectionCurrents-v0", "eitbench/Pipe2DInjectionBudget-v0"
 SHORT = {"world": {"flow": {"mean_velocity": 16.0}, "schedule": {"scored_steps": 4}}}
-"""Four steps of the agent an episode."""
+"""An episode with four steps of the agent."""
 TINY = TrainingConfig(total_steps=32, n_envs=2, interval=16, evaluation_episodes=2, episodes=3, hidden=(8,),
               algorithm={"n_steps": 8, "batch_size": 8})
 RUNS = {"ppo": (NAME, {"n_steps": 8, "batch_size": 8}), "maskable_ppo": (BUDGET, {"n_steps": 8, "batch_size": 8}),
@@ -46,14 +46,14 @@ def vector(episodes=3):
     return gym.make_vec(NAME, num_envs=3, vectorization_mode="vector_entry_point", episodes=episodes, **SHORT)
 
 
-def test_sb3_sees_what_the_environments_show():
-    """Step by step the observations and rewards of single environments, over an episode's end; rewards scaled."""
+def test_sb3_receives_the_observations_of_the_environments():
+    """Each step has the observations and rewards of single environments, across episodes; rewards are scaled."""
     envs = vector()
     ours = InjectionVecEnv(envs, reward_scale=10.0)
     ours.seed(5)
     shown = ours.reset()
     started = list(envs.seeds)
-    assert len(set(started)) == 3                       # environments of one seed would be twins from then on
+    assert len(set(started)) == 3                       # else environments with equal seeds would be identical
     single = [gym.make(NAME, episodes=3, **SHORT) for _ in range(3)]
     expected = [env.reset(seed=k)[0] for env, k in zip(single, started, strict=True)]
     np.testing.assert_array_equal(shown, expected)
@@ -73,8 +73,8 @@ def test_sb3_sees_what_the_environments_show():
             np.testing.assert_array_equal(shown, [each[0] for each in outcome])
 
 
-def test_every_algorithm_leaves_a_whole_run(run):
-    """Model, configuration, evaluations that are the model's own, and a checksum; the same command changes nothing."""
+def test_every_algorithm_finishes_a_run(run):
+    """A run has model, configuration, evaluations of the model, and a checksum; the same command changes nothing."""
     env, kwargs, algo, config, path = run
     folder = path.parent
     model = ALGORITHMS[algo].load(path)
@@ -85,7 +85,7 @@ def test_every_algorithm_leaves_a_whole_run(run):
     assert json.loads((folder / "config.json").read_text())["algo"] == algo
     assert not (getattr(model.policy, "actor", None) or model.policy).optimizer.state
     assert len((folder / "sha256").read_text()) == 64 and not (folder / "latest.zip").exists()
-    with ZipFile(path) as model_zip:                                                     # fifteen are kept in git
+    with ZipFile(path) as model_zip:                                                     # fifteen are stored in git
         assert {file.compress_type for file in model_zip.infolist()} == {ZIP_DEFLATED}
     before = {each: each.stat().st_mtime_ns for each in folder.iterdir()}
     assert train(env, algo, config, 1, folder, kwargs) == path
@@ -93,7 +93,7 @@ def test_every_algorithm_leaves_a_whole_run(run):
 
 
 def test_an_agent_acts_as_it_was_evaluated(run):
-    """As a policy its errors are those of the last evaluation, whichever filter the environment has."""
+    """The errors of its policy equal the last evaluation, for any filter of the environment."""
     env, kwargs, algo, config, path = run
     expected = np.load(path.parent / "evaluations.npz")["errors"][-1]
     errors = [injected(env, kwargs, str(path), seed, "reduced").errors.mean() for seed in (100_000, 100_001)]
@@ -143,7 +143,7 @@ def test_a_killed_run_loses_no_more_than_an_interval(tmp_path, monkeypatch):
         train(NAME, "ppo", TINY, 2, tmp_path, SHORT)
     content = path.read_bytes()
     path.write_bytes(content + b"x")
-    assert load_agent(path, content)[0].startswith("ppo_")       # what was checked is what is loaded
+    assert load_agent(path, content)[0].startswith("ppo_")       # the checked content is loaded, not the file
     with pytest.raises(ValueError, match="must have the sha256 of its folder"):
         load_method(str(path), "injection")
     (tmp_path / "sha256").unlink()
@@ -152,8 +152,8 @@ def test_a_killed_run_loses_no_more_than_an_interval(tmp_path, monkeypatch):
 
 
 def test_the_same_seed_learns_the_same(tmp_path):
-    """Two runs end with the same networks, on however many threads; another seed with others."""
-    config = replace(TINY, n_envs=32, total_steps=256)            # so many that products are worth threads
+    """Two runs give the same networks, for any number of threads; another seed gives others."""
+    config = replace(TINY, n_envs=32, total_steps=256)            # large enough for multithreaded products
 
     def networks(seed, name, threads):
         with threadpool_limits(threads):
@@ -163,8 +163,8 @@ def test_the_same_seed_learns_the_same(tmp_path):
     assert (first == again).all() and (first != other).any()
 
 
-def test_an_estimate_that_is_not_finite_shows(monkeypatch):
-    """States that are not scored are left out of an evaluation, a scored one that is not a number is not."""
+def test_failed_estimates_are_in_evaluations(monkeypatch):
+    """Unscored states are excluded from an evaluation, failed estimates of scored states are not."""
     class Still:
         def predict(self, *_, **__):
             return np.zeros(2, dtype=int), None
@@ -174,8 +174,8 @@ def test_an_estimate_that_is_not_finite_shows(monkeypatch):
     assert list(np.isnan(training.make_evaluator(NAME, SHORT, TINY)(Still()))) == [False, True]
 
 
-def test_a_pupil_learns_what_its_teacher_does(tmp_path):
-    """After imitation alone the agent does what the teacher does: here always the same pair."""
+def test_imitation_learns_the_teachers_actions(tmp_path):
+    """After imitation alone the agent has the teacher's actions: here always the same pair."""
     config = replace(TINY, total_steps=0, imitate={"teacher": "best_pair", "rounds": 2, "episodes": 3, "epochs": 60})
     model = ALGORITHMS["ppo"].load(train(NAME, "ppo", config, 0, tmp_path, SHORT))
     observation, _ = gym.make(NAME, **SHORT).reset(seed=2)
@@ -190,8 +190,8 @@ def test_a_pupil_learns_what_its_teacher_does(tmp_path):
     ("total_steps: 1\nanneal: 'no'\n", "anneal must be true or false, got 'no'"),
     ("total_steps: -1\n", "total_steps must"), ("total_steps: 1\nreward_scale: 0\n", "reward_scale must"),
 ])
-def test_wrong_configurations_are_named(text, message, tmp_path):
-    """A wrong file is named before anything is trained."""
+def test_invalid_configurations_are_reported(text, message, tmp_path):
+    """A wrong file is reported before the training starts."""
     path = tmp_path / "config.yml"
     path.write_text(text)
     with pytest.raises(ValueError, match=message):
@@ -211,15 +211,15 @@ def test_wrong_configurations_are_named(text, message, tmp_path):
     (NAME, "ppo", {}, {"episodes": 3, "estimator": "full"}, "kwargs must not hold.*; got episodes, estimator"),
     (NAME, "ppo", {"algorithm": {"n_steps": 0}}, {}, "algorithm must hold valid arguments of ppo: "),
 ])
-def test_wrong_arguments_are_named_before_the_folder_is_taken(env, algo, change, kwargs, message, tmp_path):
-    """So that the same folder can be used once the mistake is fixed."""
+def test_invalid_arguments_are_reported_before_any_writing(env, algo, change, kwargs, message, tmp_path):
+    """After a correction the same folder can be used."""
     with pytest.raises(ValueError, match=message):
         train(env, algo, replace(TINY, **({"algorithm": {}} | change)), 0, tmp_path, SHORT | kwargs)
     assert not list(tmp_path.iterdir())
 
 
 def test_rewards_of_a_reference_are_subtracted(tmp_path):
-    """Rewards of a policy in the same episodes, step by step, in this episode and the next."""
+    """Rewards of a policy in the same episodes are subtracted step by step, in this episode and the next."""
     world = gym.make(NAME, episodes=5, observation="raw", **SHORT).unwrapped
     reference = training.policy_rewards("best_pair", world, tmp_path / "reference.npy")
     envs, plain = vector(5), vector(5)
