@@ -236,7 +236,7 @@ def test_a_frame_is_not_scored_by_itself():
     """Without a homogeneous frame nothing is scored; an absolute image shows the inclusion."""
     single = replace(stationary(), reference=None)
     env = MeasuredEnv(single, VESSEL, initial_std=0.2)
-    assert "no homogeneous frame" in env.quality_warnings()[0]
+    assert "homogeneous frame is missing" in env.quality_warnings()[0]
     assert np.isnan(run_on_measurements(env, "gauss_newton").withheld_rmse)
     env = MeasuredEnv(single, VESSEL, initial_std=0.2, correction="none")
     run = run_on_measurements(env, "gauss_newton")
