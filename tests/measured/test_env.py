@@ -106,7 +106,7 @@ def test_repeated_injections_in_a_frame_are_not_motion(measurements):
 
 @pytest.mark.parametrize(("changes", "message"), [
     ({"vessel": VESSEL | {"electrodes": 16}}, "vessel must have the 8 electrodes of the measurements, got 16"),
-    ({"withheld": 0.7}, "withheld"), ({"correction": "none"}, "correction must be one of"),
+    ({"withheld": 0.7}, "withheld"), ({"correction": "median"}, "correction must be one of"),
     ({"model_error": -1.0}, "model_error"), ({"homogeneous_frames": 0}, "n_frames must be")])
 def test_invalid_arguments_are_named(measurements, changes, message):
     if "homogeneous_frames" in changes:

@@ -195,7 +195,7 @@ def test_file_of_a_vessel_does_not_describe_a_table(tmp_path):
     (tmp_path / "tank.yml").write_text("kind: circle\nradius: 0.1\n")
     assert read(tmp_path / "tank.csv").voltages.shape == (2, 8)
     (tmp_path / "tank.csv.yml").unlink()
-    with pytest.raises(ValueError, match=r"no tank\.csv\.yml"):
+    with pytest.raises(ValueError, match=r"neither tank\.csv\.yml"):
         read(tmp_path / "tank.csv")
 
 
