@@ -207,7 +207,7 @@ def located(measurements, **options):
 
 
 def test_lost_measurements_are_left_out_one_by_one(measurements):
-    """With 5 % lost all channels are used, and the inclusion is found within 5 mm of the complete data's."""
+    """If 5 % are lost all channels are used, and the inclusion is within 5 mm of the complete data's."""
     _, complete, position = located(measurements)
     lost = np.random.default_rng(0).random(measurements.voltages.shape) < 0.05
     env, run, found = located(replace(measurements, voltages=np.where(lost, np.nan, measurements.voltages)))
