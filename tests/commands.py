@@ -1,4 +1,4 @@
-"""The command line, as a user sees it."""
+"""Run the command line as a user."""
 
 import re
 
@@ -7,8 +7,8 @@ from typer.testing import CliRunner
 
 
 def eitbench(*arguments):
-    """Exit code, standard output, and standard error without boxes and line breaks; what a user would see as a
-    traceback is raised."""
+    """Return exit code, standard output, and standard error without boxes and line breaks; raise errors that a user
+    would get as a traceback."""
     done = CliRunner().invoke(app, list(map(str, arguments)))
     if done.exception is not None and not isinstance(done.exception, SystemExit):
         raise done.exception

@@ -1,4 +1,4 @@
-"""Which tests are the core, what processes of a run share, and one BLAS thread for each (several on
+"""Marks of slow tests, the cache that processes share, and one BLAS thread per process (several on
 few cores are slower, not faster)."""
 
 import hashlib
@@ -12,29 +12,29 @@ for variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ[variable] = "1"
 
 settings.register_profile("ours", deadline=None, derandomize=True, database=None)
-settings.load_profile("ours")                         # a busy machine is no failure; each run tries the same examples
+settings.load_profile("ours")                         # no deadline, for busy machines; the same examples in each run
 TESTS = Path(__file__).parent
 PLACES = {
-    "studies": "study",                        # the statements and figures of the thesis
+    "studies": "study",                        # reproduces statements and figures of the thesis
     "rl": "study",                             # trains agents
-    "examples": "study",                       # installs two packages and plays with them
+    "examples": "study",                       # installs and uses two packages
     "bench/test_golden.py": "study",           # simulates every world, runs every method
-    "bench/test_checkpoints.py": "study",      # plays every trained agent
-    "bench/test_verify.py": "study",           # plays records again, and false ones
+    "bench/test_checkpoints.py": "study",      # runs every trained agent
+    "bench/test_verify.py": "study",           # reruns valid and falsified records
     "test_docs.py::test_documentation_builds": "study",
     "report/test_boards.py::test_published_files_are_rendered_from_the_records": "study",
     "report/test_site.py::test_the_published_site_is_rendered_from_the_records": "study",
     "report/test_site_browser.py": "browser",
 }
-"""What is not the core, by folder, file or test: `pytest -m "not browser and not study"` leaves it out."""
+"""Slow tests by folder, file or test: `pytest -m "not browser and not study"` omits these two groups."""
 for place in PLACES:
     assert (TESTS / place.partition("::")[0]).exists(), f"there is no {place}"
 
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items):
-    """Mark what is not the core, and begin with it: what takes long is not to be what is left at
-    the end, when the other processes have nothing to do any more."""
+    """Mark slow tests and run them first, so that no process is left with a long test at
+    the end, when other processes are idle."""
     for item in items:
         file = item.path.relative_to(TESTS)
         test = f"{file.as_posix()}::{item.originalname}"
@@ -48,13 +48,13 @@ def pytest_collection_modifyitems(items):
 
 @pytest.fixture(scope="session")
 def run_cache(pytestconfig, tmp_path_factory):
-    """A cache folder that all processes share, and the next run of the same code too. (Users' caches
+    """Share a cache folder between all processes, and with the next run of the same code. (Users' caches
     depend on declared versions instead; tests must notice a change before its version is raised.)
     `pytest --cache-clear` empties it. With `-p no:cacheprovider` a folder of this process."""
     kept = getattr(pytestconfig, "cache", None)
     if not kept:
         return str(tmp_path_factory.mktemp("episodes"))
-    import eitbench  # not before BLAS has been told how many threads
+    import eitbench  # after the number of BLAS threads is set
     code = hashlib.sha256()
     for package in ("numerics", "physics", "worlds", "data"):
         for file in sorted(Path(eitbench.__file__).parent.joinpath(package).glob("*.py")):
@@ -64,7 +64,7 @@ def run_cache(pytestconfig, tmp_path_factory):
 
 @pytest.fixture(scope="session", autouse=True)
 def nobodys_own_cache(run_cache):
-    """Tests that set no cache folder of their own use this one, never the developer's."""
+    """Use this cache folder in tests that set none, instead of the developer's."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("EITBENCH_CACHE", run_cache)
         yield

@@ -1,4 +1,4 @@
-"""Injection environments that leave the agent few steps, and what tests do with them."""
+"""Injection environments with few steps for the agent, and helpers for their tests."""
 
 import json
 
@@ -14,31 +14,31 @@ from short import merged
 NAME, INFLOW = "eitbench/Pipe2DInjection-v0", "eitbench/Pipe2DInjectionInflow-v0"
 CURRENTS, FAULTS, BUDGET = (f"eitbench/Pipe2DInjection{kind}-v0" for kind in ("Currents", "Faults", "Budget"))
 TANK, FLOW = "eitbench/RotatingTankInjection-v0", "eitbench/Pipe2DInjectionFlow-v0"
-# Sixteen electrodes and a short record; fewer electrodes would leave too little to learn from.
+# Sixteen electrodes and a short episode; fewer electrodes have too little information.
 SHORT = {"flow": {"mean_velocity": 16.0}, "schedule": {"scored_steps": 4}}
 
 
 def make(estimator: str = "none", name: str = NAME, observation: str = "raw", longer: dict | None = None,
          **kwargs) -> gym.Env:
-    """An environment with a short world, in which ``longer`` changes some more numbers."""
+    """Make an environment with a short world; ``longer`` overrides more parameters."""
     return gym.make(name, estimator=estimator, world=merged(world(name), longer or {}), observation=observation,
                     **kwargs)
 
 
 def world(name: str) -> dict:
-    """Changes of the world that leave the agent few steps."""
+    """Return overrides of the world with few steps for the agent."""
     if name == FLOW:
         return merged(SHORT, {"flow": {"velocity_range": [15.0, 17.0]}})
     return {"schedule": {"warm_up": 2, "scored_steps": 3}} if name == TANK else SHORT
 
 
 def filter_of(whose):
-    """The filters inside an environment that asks for injections, or those a policy's belief follows."""
+    """Return the filters of an injection environment, or of a policy's belief."""
     return (whose.unwrapped.core if isinstance(whose, gym.Env) else whose)._filters
 
 
 def play(env: gym.Env, seed: int, actions: np.ndarray) -> list[tuple]:
-    """(observation, reward, terminated, truncated, info) of the whole episode under the given actions."""
+    """Return (observation, reward, terminated, truncated, info) of each step of an episode under these actions."""
     observation, info = env.reset(seed=seed)
     steps = [(observation, 0.0, False, False, info)]
     while not steps[-1][2]:
@@ -52,7 +52,7 @@ def some_pairs(steps: int = 120, envs: int = 1, seed: int = 0) -> np.ndarray:
 
 
 def some_actions(env: gym.Env, steps: int = 120) -> np.ndarray:
-    """Actions of the environment's kind."""
+    """Return actions of the environment's kind."""
     if env.action_space.shape:
         return np.random.default_rng(0).uniform(-1.0, 1.0, (steps, *env.action_space.shape)).astype(np.float32)
     return some_pairs(steps)
@@ -63,6 +63,6 @@ def arrays_of(observation) -> list[np.ndarray]:
 
 
 def injected(name: str, kwargs: dict, policy: str, seed: int, estimator: str = "full") -> Outcome:
-    """What can be scored of an episode that a policy plays, with this filter inside."""
+    """Return the outcome of a policy's episode with this filter, for scores."""
     asked = Environment(name, json.dumps(kwargs | {"estimator": estimator}))
     return runner.run_method(asked, load_method(policy, "injection"), seed).outcome

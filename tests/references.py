@@ -1,6 +1,6 @@
-"""What the compiled kernels compute, by scipy and numpy alone: references for tests and benchmarks.
+"""Results of the compiled kernels by scipy and numpy alone: references for tests and benchmarks.
 
-Nothing here comes from the code under test but the models around the kernels.
+Only the models around the kernels are code under test.
 """
 
 from __future__ import annotations
@@ -20,13 +20,13 @@ SYMMETRIC = {"diag_pivot_thresh": 0.0, "options": {"SymmetricMode": True}}
 class SuperLUCondensation:
     """`eitbench.numerics.condensation.Condensation` by SuperLU, ordered by minimum degree.
 
-    It takes all entries of the pattern, both triangles.
+    It requires all entries of the pattern, both triangles.
     """
 
     batch = 1
 
     def __init__(self, pattern: sp.csc_array, n_ports: int, places: np.ndarray | None = None) -> None:
-        del places                                       # only the speed depends on the order
+        del places                                       # the order affects only the speed
         self.n = pattern.shape[0]
         self.n_ports = n_ports
         inner = pattern[:-n_ports, :-n_ports]
@@ -42,13 +42,13 @@ class SuperLUCondensation:
         self._loads = np.eye(self.n, n_ports, -(self.n - n_ports))
 
     def port_inverse(self, values: np.ndarray) -> np.ndarray:
-        """The ports' block of K⁻¹: (m, m) for values (k,), (b, m, m) for values (k, b)."""
+        """Return the ports' block of K⁻¹: (m, m) for values (k,), (b, m, m) for values (k, b)."""
         if values.ndim == 1:
             return self._factorised(values).solve(self._loads)[-self.n_ports:]
         return np.stack([self.port_inverse(column) for column in values.T])
 
     def port_columns(self, values: np.ndarray) -> np.ndarray:
-        """The ports' columns of K⁻¹, (n, m), for values (k,)."""
+        """Return the ports' columns of K⁻¹, (n, m), for values (k,)."""
         return self._factorised(values).solve(self._loads)[self._place]
 
     def _factorised(self, values: np.ndarray) -> SuperLU:
@@ -57,7 +57,7 @@ class SuperLUCondensation:
 
 
 def _minimum_degree(pattern: sp.csc_array) -> np.ndarray:
-    """Position of each unknown in a fill-reducing order."""
+    """Return the position of each unknown in a fill-reducing order."""
     ones = pattern.copy()
     ones.data = np.full(pattern.nnz, -1.0)
     dominant = ones + sp.diags_array(2.0 + np.diff(pattern.indptr).astype(float))
@@ -71,9 +71,9 @@ class SuperLUSolver:
         self.factors = splu(sp.csc_matrix(matrix), permc_spec="MMD_AT_PLUS_A", **SYMMETRIC)
 
     def solve(self, right: np.ndarray) -> np.ndarray:
-        """A⁻¹ b for (n, k)."""
+        """Return A⁻¹ b for (n, k)."""
         result = np.empty(right.shape)
-        for column in range(right.shape[1]):      # the bits depend on how many are solved together
+        for column in range(right.shape[1]):      # rounding depends on the number of columns
             result[:, column] = self.factors.solve(right[:, column].astype(float))
         return result
 
@@ -107,13 +107,13 @@ class NumpySensitivity:
 
 
 class AllColumns:
-    """`ConvectionDiffusion._advance_wide` by the flow's own sub-steps, of all columns at once."""
+    """`ConvectionDiffusion._advance_wide` by `_substeps` of all columns at once."""
 
     def __init__(self, flow: transport.ConvectionDiffusion) -> None:
         self._flow = flow
 
     def advance(self, c, before, after, source=None):
-        """As there; the first sub-step is two halves."""
+        """Compute the same result; the first sub-step is two halves."""
         flow = self._flow
         loads = [0.0] * (flow.substeps + 1)
         if source is not None:
@@ -124,7 +124,7 @@ class AllColumns:
 
 @contextmanager
 def references():
-    """Electrode models and flows that are made within compute by these classes."""
+    """Use these classes in electrode models and flows that are built within."""
     with (mock.patch.object(cem, "Condensation", SuperLUCondensation),
           mock.patch.object(cem, "Sensitivity", NumpySensitivity),
           mock.patch.object(transport, "SparseLU", SuperLUSolver)):
@@ -141,7 +141,7 @@ def reference_model(*arguments, **options) -> cem.CompleteElectrodeModel:
 
 
 def unsymmetrised(model: cem.CompleteElectrodeModel, conductivity: np.ndarray) -> np.ndarray:
-    """𝓡 with the last electrode grounded, (L − 1, L − 1), as the factorisation gives it."""
+    """Return 𝓡 with the last electrode grounded, (L − 1, L − 1), from the factorisation."""
     return model._system.port_inverse(model._assemble(conductivity))
 
 

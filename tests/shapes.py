@@ -1,4 +1,4 @@
-"""Shapes for the tests of the electrode model, and resistances found without the code under test."""
+"""Shapes for the tests of the electrode model, and resistances computed without the code under test."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from scipy.special import roots_jacobi, spherical_jn
 
 
 def shaken_rectangle(width: float, height: float, cells: tuple[int, int], rng: np.random.Generator) -> Mesh:
-    """A rectangle with its corner at the origin whose inner nodes are moved at random: no two cells are alike."""
+    """Return a rectangle with its corner at the origin whose inner nodes are moved at random."""
     return _shaken(box_mesh((width, height), cells), np.array([width, height]), np.array(cells), rng)
 
 
 def box_mesh(size: Sequence[float], cells: Sequence[int]) -> Mesh:
-    """A rectangle or a box with its corner at the origin; every brick is split into the six tetrahedra along one
+    """Return a rectangle or a box with its corner at the origin; each brick is split into six tetrahedra along one
     diagonal."""
     if len(size) == 2:
         return rectangle_mesh(*(np.linspace(0.0, length, n + 1) for length, n in zip(size, cells, strict=True)))
@@ -38,7 +38,7 @@ def box_mesh(size: Sequence[float], cells: Sequence[int]) -> Mesh:
 
 
 def shaken_box(size: Sequence[float], cells: Sequence[int], rng: np.random.Generator) -> Mesh:
-    """A box whose inner nodes are moved at random."""
+    """Return a box whose inner nodes are moved at random."""
     return _shaken(box_mesh(size, cells), np.asarray(size, dtype=float), np.asarray(cells), rng)
 
 
@@ -49,14 +49,14 @@ def _shaken(mesh: Mesh, size: np.ndarray, cells: np.ndarray, rng: np.random.Gene
 
 
 def end_facets(mesh: Mesh) -> list[np.ndarray]:
-    """The boundary facets at the smallest and at the largest x."""
+    """Return the boundary facets at the smallest and at the largest x."""
     x = mesh.points[:, 0]
     tiny = 1e-9 * np.ptp(x)
     return [mesh.facets_where(lambda p, end=end: np.abs(p[:, 0] - end) < tiny) for end in (x.min(), x.max())]
 
 
 def polar_mesh(radii: np.ndarray, angles: np.ndarray) -> Mesh:
-    """Nodes at all ``radii`` (m) and ``angles`` (rad, one turn without its end); a disc if the first radius is zero."""
+    """Return a mesh of nodes at all ``radii`` (m) and ``angles`` (rad, one turn); a disc if the first radius is 0."""
     n = len(angles)
     circle = np.stack([np.cos(angles), np.sin(angles)], axis=1)
     disc = int(radii[0] == 0.0)
@@ -74,7 +74,7 @@ def polar_mesh(radii: np.ndarray, angles: np.ndarray) -> Mesh:
 
 
 def ring_facets(mesh: Mesh, radius: float, span: tuple[float, float] = (0.0, 2 * np.pi)) -> np.ndarray:
-    """Boundary facets with their nodes at ``radius`` and from angle ``span[0]`` to ``span[1]``, ends included."""
+    """Return boundary facets with nodes at ``radius`` and from angle ``span[0]`` to ``span[1]``, ends included."""
     def on_arc(p: np.ndarray) -> np.ndarray:
         angle = np.mod(np.arctan2(p[:, 1], p[:, 0]) + 1e-9, 2 * np.pi)
         on_circle = np.abs(np.hypot(p[:, 0], p[:, 1]) - radius) < 1e-9 * radius
@@ -83,7 +83,7 @@ def ring_facets(mesh: Mesh, radius: float, span: tuple[float, float] = (0.0, 2 *
 
 
 def disc_mesh(radius: float, spans: np.ndarray, cells: int, grading: float = 1.5) -> tuple[Mesh, list[np.ndarray]]:
-    """A disc and its electrodes: ``cells`` on each electrode and gap, crowded at the edges, 2 × on a radius.
+    """Return a disc and its electrodes: ``cells`` on each electrode and gap, denser at the edges, 2 × on a radius.
 
     ``spans`` (L, 2) are the electrodes' first and last angles, increasing within [0, 2π).
     """
@@ -97,18 +97,18 @@ def disc_mesh(radius: float, spans: np.ndarray, cells: int, grading: float = 1.5
 
 
 def slab_resistance(length: float, area: float, conductivity: float, contact_impedance: Sequence[float]) -> float:
-    """Between two ends that are electrodes all over: the current flows straight."""
+    """Return the resistance between two ends covered by electrodes: the current is uniform."""
     return length / (conductivity * area) + sum(contact_impedance) / area
 
 
 def annulus_resistance(a: float, b: float, conductivity: float, contact_impedance: Sequence[float]) -> float:
-    """Between the whole inner circle and the whole outer one: the current flows along the radii."""
+    """Return the resistance between the inner and the outer circle: the current is radial."""
     inner, outer = contact_impedance
     return np.log(b / a) / (2 * np.pi * conductivity) + inner / (2 * np.pi * a) + outer / (2 * np.pi * b)
 
 
 def disc_modes(conductivity: Callable[[np.ndarray], np.ndarray], radius: float, modes: int = 40) -> np.ndarray:
-    """Λ_n = (potential / current density) of cos nθ at the wall, n = 1 … modes, for a radial σ(r).
+    """Return Λ_n = (potential / current density) of cos nθ at the wall, n = 1 … modes, for a radial σ(r).
 
     With u = f(r) cos nθ, (rσf')' = n²σf/r; the quotient w = rσf'/(nf) obeys dw/d(ln r) = n(σ² − w²)/σ, is σ at the
     centre, where σ must be constant, and Λ_n = radius/(n w(radius)).
@@ -127,12 +127,12 @@ def disc_modes(conductivity: Callable[[np.ndarray], np.ndarray], radius: float, 
 
 def disc_resistance(radius: float, spans: np.ndarray, contact_impedance: np.ndarray, modes: np.ndarray,
                     wall_conductivity: float, degree: int = 24, n_modes: int = 30_000) -> np.ndarray:
-    """𝓡 of a disc under the complete electrode model, without a mesh.
+    """Return 𝓡 of a disc under the complete electrode model, without a mesh.
 
     The current density of electrode l is a sum of Legendre polynomials over its arc; its Fourier coefficients are
-    spherical Bessel functions, mode n of the potential is Λ_n times that of the density, and u + z j = U_l is tested
-    with the same polynomials: G j = (U_l |e_l| on the constants). ``modes`` holds the first Λ_n, the others are those
-    of a uniform ``wall_conductivity``.
+    spherical Bessel functions, mode n of the potential is Λ_n times mode n of the density, and u + z j = U_l is tested
+    with the same polynomials: G j = (U_l |e_l| on the constants). ``modes`` holds the first Λ_n, the others belong to
+    a uniform ``wall_conductivity``.
     """
     n = np.arange(1, n_modes + 1)
     symbol = radius / (n * wall_conductivity)
@@ -164,7 +164,7 @@ class DenseSolution(NamedTuple):
 
 def dense_solution(mesh: Mesh, electrodes: list[np.ndarray], z: np.ndarray, order: int, sigma: np.ndarray,
                    currents: np.ndarray) -> DenseSolution:
-    """The saddle-point system of the complete electrode model with ΣU = 0 as a row of its own."""
+    """Solve the saddle-point system of the complete electrode model with ΣU = 0 as a separate row."""
     d = mesh.dim
     number: dict[tuple[int, ...], int] = {(i,): i for i in range(mesh.n_nodes)}
 
@@ -204,7 +204,7 @@ def dense_solution(mesh: Mesh, electrodes: list[np.ndarray], z: np.ndarray, orde
 
 
 def simplex_rule(d: int, points: int = 5) -> tuple[np.ndarray, np.ndarray]:
-    """Barycentric points and weights (sum 1) by collapsing a cube of Gauss-Jacobi points; exact to degree 9."""
+    """Return barycentric points and weights (sum 1) of a collapsed cube of Gauss–Jacobi points; exact to degree 9."""
     bary, weight = np.ones((1, 1)), np.ones(1)
     for k in range(1, d + 1):
         t, w = roots_jacobi(points, k - 1, 0)                         # weight (1 − t)^(k−1) of the collapsed directions
@@ -215,7 +215,7 @@ def simplex_rule(d: int, points: int = 5) -> tuple[np.ndarray, np.ndarray]:
 
 
 def lagrange(bary: np.ndarray, order: int) -> tuple[np.ndarray, np.ndarray]:
-    """Shape functions (q, n) at barycentric points, nodes first and then edges, and their slopes (q, n, d + 1)."""
+    """Return shape functions (q, n) at barycentric points, nodes before edges, and their slopes (q, n, d + 1)."""
     vertices = bary.shape[1]
     unit = np.eye(vertices)
     if order == 1:

@@ -1,4 +1,4 @@
-"""A short world for every id: what is promised does not depend on the length of a record."""
+"""A short world for each id: guarantees do not depend on the length of an episode."""
 
 from dataclasses import replace
 
@@ -9,7 +9,7 @@ PLAIN = [name for name, each in entries().items() if each.world == entry("eitben
 
 
 def merged(*changes: dict) -> dict:
-    """Changes of a world put together, part by part."""
+    """Merge overrides of a world by component."""
     result: dict = {}
     for each in changes:
         for name, value in each.items():
@@ -46,11 +46,11 @@ SHORT = {
     "RotatingTank2D": TANK,
     "StationaryTank2D": {"vessel": {"n_electrodes": 8}, "schedule": {"scored_steps": 5}},
 }
-"""Changes that make a world's episodes short, by its name; electrodes that fail leave some of four sound."""
+"""Name of a world -> overrides for short episodes; some of four electrodes stay intact."""
 
 
 def world(name: str) -> dict:
-    """Keyword arguments that make an id's episodes short."""
+    """Return keyword arguments for short episodes of an id."""
     each = entry(name).world
     kind = "Pipe2DInjectionFaults" if each.instrument.max_faulty else each.name
     assert kind in SHORT, f"{name} has no short version yet: give {kind!r} one in tests/short.py"
@@ -58,19 +58,19 @@ def world(name: str) -> dict:
 
 
 def short(name: str) -> dict:
-    """And its training episodes few."""
+    """Return keyword arguments for short episodes and few training episodes."""
     return world(name) | {"episodes": 2}
 
 
 def register_apart(monkeypatch) -> None:
-    """Undo registrations after the test."""
+    """Restore the registry after the test."""
     hands = {each.id for each in registry.runtime_entries()}
     monkeypatch.setattr(registry, "_entries", registry.entries())
     monkeypatch.setattr(registry, "_runtime_ids", hands)
 
 
 def shorten(monkeypatch, changes: dict[str, dict]) -> None:
-    """Give registered ids other worlds, in other processes too: id -> changes of the world."""
+    """Override worlds of registered ids (id -> overrides), in other processes too."""
     register_apart(monkeypatch)
     registry.import_entries([replace(entry(name), world=entry(name).world.with_changes(each))
                              for name, each in changes.items()])

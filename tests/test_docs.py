@@ -1,4 +1,4 @@
-"""README and documentation: links lead somewhere. Building the site (`docs/build.py`) checks more: anchors of generated
+"""README and documentation: links are valid. Building the site (`docs/build.py`) checks more: anchors of generated
 pages, README's first snippet, the notebooks."""
 
 import json
@@ -15,14 +15,14 @@ PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", ROOT / "CHANGELOG.md",
 
 
 def anchors(path: Path) -> set[str]:
-    """Of a page's headings, as GitHub and the site make them."""
+    """Return the anchors of a page's headings on GitHub and on the site."""
     text = re.sub(r"^```.*?^```$", "", path.read_text(encoding="utf-8"), flags=re.DOTALL | re.MULTILINE)
     headings = re.findall(r"^#+ (.*)$", text, re.MULTILINE)
     return {re.sub(r"[^\w -]", "", heading).strip().lower().replace(" ", "-") for heading in headings}
 
 
 def targets(path: Path) -> list[str]:
-    """Where the links and pictures of a page or notebook lead."""
+    """Return the targets of the links and images of a page or notebook."""
     text = path.read_text(encoding="utf-8")
     if path.suffix == ".ipynb":
         cells = [cell for cell in json.loads(text)["cells"] if cell["cell_type"] == "markdown"]
@@ -34,7 +34,7 @@ def targets(path: Path) -> list[str]:
 @pytest.mark.parametrize("page", [*PAGES, *sorted((ROOT / "docs" / "notebooks").glob("*.ipynb"))],
                          ids=lambda path: path.relative_to(ROOT).as_posix())
 def test_links_lead_somewhere(page):
-    """Every link within the repository names a file or folder that is there, and a heading of it."""
+    """Every link within the repository points to an existing file or folder, and to an existing heading."""
     for target in targets(page):
         name, _, anchor = target.partition("#")
         there = (page.parent / name).resolve() if name else page
@@ -43,12 +43,12 @@ def test_links_lead_somewhere(page):
 
 
 def test_readme_is_short():
-    """Whoever opens it reads to the end."""
+    """README has less than 120 lines."""
     assert len((ROOT / "README.md").read_text(encoding="utf-8").splitlines()) < 120
 
 
 def test_an_estimator_reads_voltages_of_ones_own(capsys):
-    """The page on measured data: the level of a homogeneous vessel comes out of its voltages."""
+    """The example in docs/measured-data.md estimates c_ref of a homogeneous vessel."""
     text = (ROOT / "docs" / "measured-data.md").read_text(encoding="utf-8")
     snippet = re.findall(r"^```python\n(.*?)^```$", text, re.DOTALL | re.MULTILINE)[1]
     exec(compile(snippet, "snippet", "exec"), {})
@@ -56,7 +56,7 @@ def test_an_estimator_reads_voltages_of_ones_own(capsys):
 
 
 def test_documentation_builds():
-    """All pages with the generated ones, links and anchors whole; no notebook is executed."""
+    """The draft has all pages, with valid links and anchors; notebooks are not executed."""
     done = subprocess.run([sys.executable, "docs/build.py", "--draft"], cwd=ROOT, capture_output=True, text=True,
                           check=False)
     assert done.returncode == 0, done.stdout + done.stderr

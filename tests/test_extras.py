@@ -1,4 +1,4 @@
-"""Playing needs the base only, and what is missing is named with the extra that brings it."""
+"""Environments need no extra; an error for a missing package names the extra that installs it."""
 
 import subprocess
 import sys
@@ -49,7 +49,7 @@ def test_what_is_missing_is_named(program, said):
 
 
 def test_each_extra_installs_what_it_is_said_to():
-    """And the base holds none of it."""
+    """The base dependencies contain none of the optional packages."""
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     distributions = packages_distributions()
     for extra, modules in EXTRAS.items():

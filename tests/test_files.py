@@ -1,4 +1,4 @@
-"""Shipped files are found from any folder; folders are replaced as a whole or not at all."""
+"""Shipped files are found from any folder; folders are replaced completely or not at all."""
 
 from pathlib import Path
 
@@ -9,7 +9,7 @@ RECORDS = Path("leaderboards/results")
 
 
 def test_ours_are_read_where_there_are_none(tmp_path, monkeypatch):
-    """A path as the README names it; one's own goes first, and what nobody has stays as it was asked for."""
+    """Paths as in the README: a user's file has priority, and a missing path is returned unchanged."""
     monkeypatch.chdir(tmp_path)
     assert resolve_input(RECORDS) == bundled_path("leaderboards") / "results"
     assert resolve_input(Path("baselines/rl/ppo.yml")).read_text().startswith("#")
@@ -21,7 +21,7 @@ def test_ours_are_read_where_there_are_none(tmp_path, monkeypatch):
 
 
 def test_a_folder_is_replaced_as_a_whole(tmp_path):
-    """Nothing else is left; if a file cannot be written, the folder stays as it was."""
+    """The new folder has no other files; if a file cannot be written, the old folder is unchanged."""
     folder = tmp_path / "site"
     for files in ({"a": b"1", "b/c": b"2"}, {"b/d": b"3"}):
         replace_folder(folder, files)

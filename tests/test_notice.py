@@ -1,4 +1,4 @@
-"""Who waits is told for what, once, and only if it is long; without a terminal the logger is told."""
+"""A notice of a slow task appears once, only for long tasks; without a terminal it goes to the logger."""
 
 import logging
 
@@ -9,7 +9,7 @@ from eitbench._notice import SlowTaskNotice
 
 @pytest.fixture
 def clock(monkeypatch):
-    """A clock that shows what it is set to."""
+    """A clock with a settable time."""
     now = [0.0]
     monkeypatch.setattr(_notice.time, "monotonic", lambda: now[0])
     return now

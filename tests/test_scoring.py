@@ -1,4 +1,4 @@
-"""Scores against integrals done by hand, definitions done by quadrature, and chance."""
+"""Scores against integrals by hand, definitions by quadrature, and random draws."""
 
 import numpy as np
 import pytest
@@ -21,13 +21,13 @@ from scipy.stats import norm
 
 @pytest.fixture(scope="module")
 def square():
-    """An uneven mesh of [0, 2] × [0, 1]: coordinates x and y of its nodes and its mass matrix."""
+    """Return nodes x, y and the mass matrix of an uneven mesh of [0, 2] × [0, 1]."""
     mesh = rectangle_mesh([0.0, 0.3, 1.1, 2.0], [0.0, 0.2, 0.9, 1.0])
     return *mesh.points.T, mass_matrix(mesh)
 
 
 def test_relative_error_is_squared_without_a_root(square):
-    """Constants: (ĉ − c)²/c² = (0.5/2)², whatever the mesh."""
+    """For constants the error is (ĉ − c)²/c² = (0.5/2)² on any mesh."""
     x, _, mass = square
     truth = np.full((3, len(x)), 2.0)
     assert relative_error(truth + 0.5, truth, mass) == pytest.approx(0.0625, rel=1e-13)
@@ -48,7 +48,7 @@ def test_relative_error_is_the_mean_of_ratios(square):
 
 
 def test_contrast_form_measures_against_the_homogeneous_estimate(square):
-    """Truth 5 + x, reference 5: the denominator is ∫x², and the homogeneous estimate itself scores 1."""
+    """For truth 5 + x and reference 5 the denominator is ∫x², and the homogeneous estimate scores 1."""
     x, y, mass = square
     truth = (5.0 + x)[None]
     assert relative_error(truth + y, truth, mass, reference=5.0) == pytest.approx(0.25, rel=1e-13)
@@ -97,7 +97,7 @@ def test_crps_is_the_closed_form_averaged_with_weights():
 
 
 def test_crps_without_spread_is_the_absolute_error():
-    """A point forecast is charged its absolute error, also beside forecasts with a spread; no warning is raised."""
+    """The CRPS of a point forecast is its absolute error, also next to forecasts with a std; no warning is raised."""
     mean, truth = np.array([[1.0, 2.0]]), np.array([[4.0, 2.0]])
     with np.errstate(all="raise", under="ignore"):
         assert crps(mean, np.zeros((1, 2)), truth, np.array([3.0, 1.0])) == pytest.approx(2.25, rel=1e-14)
@@ -124,7 +124,7 @@ def test_coverage_is_weighted_over_space():
 
 
 def test_spread_ratio_compares_variance_with_squared_error():
-    """By hand (3·1 + 1·4)/(3·4 + 1·16) = ¼; near one for honest Gaussians, four times that when std is doubled."""
+    """The ratio is (3·1 + 1·4)/(3·4 + 1·16) = ¼ by hand, and 1 for calibrated Gaussians, 4 with twice the std."""
     mean, std, truth = np.zeros((1, 2)), np.array([[1.0, 2.0]]), np.array([[2.0, 4.0]])
     assert spread_ratio(mean, std, truth, np.array([3.0, 1.0])) == pytest.approx(0.25, rel=1e-14)
     rng = np.random.default_rng(3)
@@ -148,30 +148,30 @@ def test_skill_runs_from_the_homogeneous_estimate_to_the_reference():
     lambda a, b: spread_ratio(a, np.ones_like(a), b, np.ones(4)),
 ], ids=["relative_error", "voltage_discrepancy", "crps", "coverage", "spread_ratio"])
 def test_arrays_must_be_a_pair_over_time_and_space(score, left, right):
-    """No broadcasting: both arrays are (T, n), or it is an error that shows both shapes."""
+    """Arrays are not broadcast: both are (T, n), or an error contains both shapes."""
     with pytest.raises(ValueError, match=r"same shape \(T, n\)"):
         score(np.ones(left), np.ones(right))
 
 
 def plate():
-    """An uneven mesh of [0, 2] × [0, 1] fine enough for a disc: points and the area of each node."""
+    """Return points and nodal areas of an uneven mesh of [0, 2] × [0, 1], fine enough for a disc."""
     mesh = rectangle_mesh(2.0 * np.linspace(0.0, 1.0, 81)**1.2, np.linspace(0.0, 1.0, 51))
     return mesh.points, mass_matrix(mesh).sum(axis=1)
 
 
 @pytest.mark.parametrize("centre", [(0.6, 0.5), (1.3, 0.3)])
 def test_deficit_lies_in_the_middle_of_a_disc(centre):
-    """A low disc of radius 0.2 in a level of 30, its nodes unevenly spaced: the centroid is its centre to a cell."""
+    """The centroid of a low disc of radius 0.2 in a level of 30 is its centre within a cell, with uneven nodes."""
     points, weights = plate()
     inside = np.hypot(*(points - centre).T) < 0.2
     found = deficit_centroid(30.0 - 10.0 * inside, points, weights)
     assert found.shape == (2,) and np.hypot(*(found - centre)) < 0.01
     unweighted = deficit_centroid(30.0 - 10.0 * inside, points, np.ones(len(points)))
-    assert np.hypot(*(found - centre)) < np.hypot(*(unweighted - centre))       # dense nodes must not pull
+    assert np.hypot(*(found - centre)) < np.hypot(*(unweighted - centre))       # dense nodes must have no larger weight
 
 
 def test_deficit_counts_only_what_is_lower_than_half():
-    """A cone and far from it a shallower hollow and a heap: only the cone's inner half counts, at its tip."""
+    """Only the inner half of a cone counts, next to a distant shallower minimum and maximum."""
     points, weights = plate()
 
     def cone(tip, depth):
@@ -182,6 +182,6 @@ def test_deficit_counts_only_what_is_lower_than_half():
 
 
 def test_flat_field_is_lowest_in_its_middle():
-    """Where nothing is lower than the rest, the centroid of the whole domain; not a division by zero."""
+    """A constant has the centroid of the whole domain, without a division by zero."""
     points, weights = plate()
     np.testing.assert_allclose(deficit_centroid(np.full(len(points), 3.0), points, weights), (1.0, 0.5), rtol=1e-12)

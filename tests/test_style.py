@@ -1,4 +1,4 @@
-"""The source passes the linter and the type checker, and keeps to the layers and line budgets of the design."""
+"""The source passes the linter and the type checker, and meets the design's layers and line budgets."""
 
 import ast
 import subprocess
@@ -26,7 +26,7 @@ def lines(*paths: Path) -> int:
 
 
 def imports(path: Path) -> set[str]:
-    """Modules of eitbench that a file imports, inside functions and under ``TYPE_CHECKING`` too."""
+    """Return the modules of eitbench that a file imports, also inside functions and under ``TYPE_CHECKING``."""
     found = set()
     for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
         if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("eitbench"):
@@ -39,7 +39,7 @@ def imports(path: Path) -> set[str]:
 
 
 def layer(module: str) -> str:
-    """Package or top-level module of a module's name; empty for ``eitbench`` itself."""
+    """Return the package or top-level module of a module's name; empty for ``eitbench`` itself."""
     return module.split(".")[1] if "." in module else ""
 
 
@@ -51,7 +51,7 @@ def test_tool_passes(tool):
 
 
 def test_each_package_imports_only_from_those_before_it():
-    """Also inside functions and for the type checker."""
+    """Imports inside functions and for the type checker obey the layers too."""
     order = list(BUDGETS)
     upwards = [f"{module} imports {other}" for module, path in MODULES.items() for other in imports(path)
                if layer(module) in order and layer(other) in order
@@ -62,7 +62,7 @@ def test_each_package_imports_only_from_those_before_it():
 
 
 def test_no_modules_import_each_other():
-    """In a circle of any length: modules that nothing left imports are taken away until none is left."""
+    """Imports have no cycle: removing modules that no remaining one imports leaves none."""
     graph = {module: imports(path) - {module} for module, path in MODULES.items() if layer(module)}
     while leaves := [module for module, others in graph.items() if not others & graph.keys()]:
         for module in leaves:
@@ -78,7 +78,7 @@ def test_package_keeps_to_its_budget(name, budget):
 
 
 def test_top_level_keeps_to_its_budget():
-    """Without the modules that are layers of their own."""
+    """Sizes exclude modules that are separate layers."""
     assert lines(*(path for path in PACKAGE.glob("*.py") if path.stem not in BUDGETS)) <= TOP
 
 

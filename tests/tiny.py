@@ -1,4 +1,4 @@
-"""A world whose episodes take a moment, and baselines written by a user of tomorrow."""
+"""A world with fast episodes, and user-defined methods."""
 
 import hashlib
 import json
@@ -22,7 +22,7 @@ RUN = {"command": "eitbench run", "blas": "scipy-openblas", "commit": "c0ffee", 
                     "stable-baselines3": None, "torch": None},
        "machine": {"processor": "An abacus", "cores": 2, "system": "Linux", "blas_threads": 1, "matmul_seconds": 0.05}}
 MARKS = ("homogeneous", "random_pair", "true_model_smoother")
-"""Floors and the reference."""
+"""Naive baselines and the oracle."""
 BOARD_IDS = {"filter": "eitbench/Pipe2D-v0", "fixed-lag": "eitbench/Pipe2DFixedLag-v0",
              "smoothing": "eitbench/Pipe2DSmoothing-v0", "injection": "eitbench/Pipe2DInjection-v0"}
 
@@ -51,7 +51,7 @@ class Estimator:
 
 def write_baseline(folder: Path, name: str = "mine", *, doc: str = "Mine: the same everywhere.", init: str = "pass",
                    update: str = "return Estimate(self.level)", parameters: str = "{}") -> str:
-    """The path of a baseline file with these statements in its methods."""
+    """Write a baseline file with these statements in its methods and return its path."""
     path = Path(folder) / f"{name}.py"
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(SOURCE.format(doc=doc, init=init, update=update, parameters=parameters))
@@ -59,7 +59,7 @@ def write_baseline(folder: Path, name: str = "mine", *, doc: str = "Mine: the sa
 
 
 def git_says(monkeypatch, commit: str | None = None, status: str | None = "") -> None:
-    """Records name this commit wherever the tests run; None: outside a checkout."""
+    """Set the commit in records; None: outside a checkout."""
     def said(*words: str) -> str | None:
         return commit if commit is None or "rev-parse" in words else status
 
@@ -68,17 +68,17 @@ def git_says(monkeypatch, commit: str | None = None, status: str | None = "") ->
 
 
 def counting(log: Path) -> str:
-    """A statement that adds a line to ``log``: one for each estimator made."""
+    """Return a statement that adds a line to ``log`` for each new estimator."""
     return f"open({str(log)!r}, 'a').write('made\\n')"
 
 
 def count(log: Path) -> int:
-    """Lines in ``log``."""
+    """Return the number of lines in ``log``."""
     return len(log.read_text().splitlines()) if log.exists() else 0
 
 
 def strict(text: str):
-    """JSON as the standard has it: no NaN, no Infinity."""
+    """Parse standard JSON, without NaN and Infinity."""
     def refuse(constant):
         raise ValueError(f"{constant} is not JSON")
 
@@ -86,12 +86,12 @@ def strict(text: str):
 
 
 def sha(text: str) -> str:
-    """A hash that looks like one."""
+    """Return a well-formed hash."""
     return hashlib.sha256(text.encode()).hexdigest()
 
 
 def episode(seed: str, error: float | None, *, seconds_per_step: float = 0.01, **scores) -> dict:
-    """An episode of a record; a failed one without an error."""
+    """Return an episode of a record; a failed one without an error."""
     shared = {"identity": "abc", "seed": seed, "finished": "2025-01-01T00:00:00+00:00", "seconds": 1.0,
               "peak_memory": None, "run": 0}
     if error is None:
@@ -103,8 +103,8 @@ def episode(seed: str, error: float | None, *, seconds_per_step: float = 0.01, *
 def record(method: str, errors: dict[str, float | None] | list[float | None], *, board: str = "filter",
            id: str | None = None, version: str = "", finished: str = "2025-01-01", scores=None,
            **changes) -> dict:
-    """A valid record of these errors by seed; those of a list are of test:0, test:1 and so on. Version v1, v2, … is one
-    of ours, of any other the file has another sha256. Default: what a floor or a reference has to have."""
+    """Return a valid record of these errors by seed; a list belongs to test:0, test:1 and so on. Versions v1, v2, … are
+    built-in; other versions have another sha256 of the file. Defaults are valid for naive baselines and oracles."""
     id = id or BOARD_IDS[board]
     version = version or ("v1" if method in MARKS else "1")
     errors = errors if isinstance(errors, dict) else {f"test:{i}": error for i, error in enumerate(errors)}
@@ -120,7 +120,7 @@ def record(method: str, errors: dict[str, float | None] | list[float | None], *,
 
 
 def several_boards() -> list[dict]:
-    """As real ones may be: three worlds, floors, a reference, shared ranks, a failure, an outdated one, odd names."""
+    """Return records of three worlds: naive baselines, an oracle, ties, a failure, an outdated record, odd names."""
     tank, floor = "eitbench/RotatingTank2D-v0", [0.20, 0.24, 0.22, 0.26, 0.18, 0.30, 0.25, 0.21]
 
     def of(factor: float) -> list[float]:

@@ -1,1 +1,1 @@
-"""Floor 3: what is simulated once and kept: episodes, recordings, and the seeds that name them."""
+"""Layer 3: simulated and cached episodes, their seeds, and data sets."""

@@ -1,7 +1,7 @@
 """A cache on disk for arrays that take long to compute: `cached(key, build)`.
 
-A key names a configuration and the version of the code that computes from it; the text of the code
-takes no part. Raise the version (`SIMULATION` and its like) when numbers or names of arrays change.
+A key identifies a configuration and the version of the code that computes from it, not the text of
+the code. Raise the version (such as `SIMULATION`) when numbers or names of arrays change.
 
 A file is a .npy of one record with a field for each array, which is memory-mapped, followed by a
 checksum of the key and all bytes. Files that the package ships are the same, compressed.
@@ -34,10 +34,10 @@ CACHE_VARIABLE = "EITBENCH_CACHE"
 PACKAGE_DATA = PACKAGE / "data" / "package_data"
 """Folder of the files that the package ships; `eitbench.bench.package_data` writes them."""
 SIMULATION = 3
-"""Version of the simulation and of what is kept of an episode."""
+"""Version of the simulation and of the arrays of a cached episode."""
 TRANSPOSED = ".T"
-"""End of the name of a field that holds a transposed array. The order in memory is kept because
-rounding in BLAS depends on it."""
+"""End of the name of a field that holds a transposed array. The order in memory is preserved
+because rounding in BLAS depends on it."""
 WORD = 8
 """Bytes of a checksum; the length of a file is a multiple."""
 
@@ -62,7 +62,7 @@ class Key(NamedTuple):
 
 
 class File(NamedTuple):
-    """Arrays of a key, and what builds them: arguments of `cached`."""
+    """Key of arrays and the function that builds them: arguments of `cached`."""
 
     key: Key
     build: Callable[[], Arrays]
@@ -83,7 +83,7 @@ def cached(key: Key, build: Callable[[], Arrays]) -> dict[str, np.ndarray]:
     """Return the arrays of a key, read-only: shipped, memory-mapped from the cache, or built.
 
     A file that is missing, damaged or of another key is built again and replaced. A cache that
-    cannot be written is a warning.
+    cannot be written causes a warning.
     """
     for load in (load_shipped, _load):
         if (found := load(key)) is not None:
@@ -109,7 +109,7 @@ def is_cached(key: Key) -> bool:
 def ship(key: Key, arrays: Arrays) -> None:
     """Write the arrays of a key into the package, atomically."""
     content = np.frombuffer(_encode(key, arrays), np.uint8)
-    # Bytes of like significance may compress better together: of 4-byte or 8-byte numbers.
+    # Bytes of 4-byte or 8-byte numbers may compress better if grouped by significance.
     packed = (bytes([size]) + lzma.compress(content.reshape(-1, size).T.tobytes(), preset=9)
               for size in (1, 4, 8))
     write_atomically(key.shipped_path, min(packed, key=len))
@@ -181,7 +181,7 @@ def config_dict(part: Any) -> Any:
 
 @lru_cache(maxsize=64)
 def world_digest(world: World) -> str:
-    """Return a digest of all of a world that a score depends on."""
+    """Return a digest of all parameters of a world on which scores depend."""
     return _digest([config_dict(world), SIMULATION])
 
 
@@ -208,7 +208,7 @@ def _checksum(key: Key, content: bytes) -> bytes:
 
 
 def _record(arrays: Arrays) -> np.ndarray:
-    """Return one record (1,) with a field for each array, whose order in memory it keeps."""
+    """Return one record (1,) with a field for each array, in the array's memory order."""
     held = {}
     for name, array in arrays.items():
         by_columns = array.flags.f_contiguous and not array.flags.c_contiguous

@@ -1,1 +1,1 @@
-"""Floor 5: the Gymnasium environments: a class a track, not a class a world."""
+"""Layer 5: Gymnasium environments, one class per track, for all worlds."""

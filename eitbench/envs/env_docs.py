@@ -1,4 +1,4 @@
-"""Compose the page of an environment: its world's text, its class docstring, and its numbers."""
+"""Compose the page of an environment: its description, class docstring, and parameters."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ KEY_DESCRIPTIONS = {
     "innovations": "measured minus predicted voltages, in predicted standard deviations",
     "mean": "estimate on {columns} × {rows} patches, x first, mol/m³",
     "std": "standard deviation of the estimate, mol/m³",
-    "doubt": "recent fraction of an electrode's readings that the gate rejected, and of injections "
-             "through the electrode",
+    "doubt": "fault score: recent fraction of an electrode's measurements that the gate rejected, "
+             "and of injections through the electrode",
     "velocity": "estimated mean velocity, m/s",
     "velocity_std": "standard deviation of the velocity, m/s",
     "left": "remaining steps and, with a budget, remaining injections",
@@ -85,7 +85,7 @@ def _observation_table(space: spaces.Dict, world: World) -> str:
 
 
 def _world_table(world: World) -> str:
-    """List every number of every part, by the names that the argument ``world`` takes."""
+    """List all parameters of all components, by the names in the argument ``world``."""
     lines = ["| name | value | meaning |", "|---|---|---|"]
     for each in fields(world):
         if each.name != "name":

@@ -39,7 +39,7 @@ MAX_CORE_EPISODES = 16
 class EpisodeCore(ABC):
     """B episodes of a world at the same step: actions in, rewards and observations out.
 
-    Of an episode that is not recorded, only the first steps are simulated until more are needed.
+    Only the first steps of an episode that is not cached are simulated until more are needed.
     """
 
     n_initial = 0
@@ -60,8 +60,8 @@ class EpisodeCore(ABC):
               provide: Callable[[World, int], None] | None = None) -> None:
         """Begin these episodes.
 
-        With ``provide``, only the first steps of episodes that are not recorded are simulated; it
-        is called with the world and each seed when later steps are needed.
+        With ``provide``, only the first steps of episodes that are not cached are simulated; it is
+        called with the world and each seed when later steps are needed.
         """
         self.seeds = tuple(seeds)
         self._provide = provide
@@ -86,7 +86,7 @@ class EpisodeCore(ABC):
 
     @abstractmethod
     def _read(self, recordings: Sequence[np.ndarray]) -> None:
-        """Copy the arrays of the episodes; a recording is mapped from a file, which stays open."""
+        """Copy the arrays of cached episodes, which are mapped from files that stay open."""
 
     @abstractmethod
     def act(self, actions: np.ndarray) -> np.ndarray:
@@ -123,14 +123,14 @@ class FixedLengthEnv(gym.Env[Any, Any]):  # type: ignore[misc]
         self._spec = made_from and replace(made_from, max_episode_steps=self.episode_steps)
 
     def check_render(self, render_mode: str | None) -> None:
-        """Set the render mode; ``ValueError`` if there is no such mode."""
+        """Set the render mode; ``ValueError`` if it does not exist."""
         if render_mode not in (None, *RENDER_MODES):
             raise ValueError(f"render_mode must be None or one of {RENDER_MODES}, "
                              f"got {render_mode!r}")
         self.render_mode = render_mode
 
     def can_render(self) -> bool:
-        """Return whether a picture can be drawn; warn without a mode."""
+        """Return whether an image can be drawn; warn without a mode."""
         if self.render_mode is None:
             gym.logger.warn("render() needs gym.make(..., render_mode='rgb_array')")
         return self.render_mode is not None
@@ -227,10 +227,10 @@ class EpisodeEnv(FixedLengthEnv):
 class EpisodeVectorEnv(gym.vector.VectorEnv[Any, np.ndarray, np.ndarray]):
     """Environments whose episodes have the same length, so that they begin and end together.
 
-    Observations equal those of ``SyncVectorEnv`` over the scalar environment, bit for bit:
+    Observations are bit-identical to ``SyncVectorEnv`` over the scalar environment:
     ``reset(seed=s)`` begins episode s + k in environment k, and the step after an episode's end
-    begins the next one (``NEXT_STEP``). A growing pool of training episodes (``episodes`` None)
-    counts the resets of all environments here, and those of each there.
+    begins the next one (``NEXT_STEP``). A growing sampler of training episodes (``episodes`` None)
+    counts the resets of all environments together; in ``SyncVectorEnv`` each counts separately.
     """
 
     metadata = {"render_modes": [], "autoreset_mode": AutoresetMode.NEXT_STEP}  # noqa: RUF012
@@ -248,7 +248,7 @@ class EpisodeVectorEnv(gym.vector.VectorEnv[Any, np.ndarray, np.ndarray]):
         first_core = self.cores[0]
         self.world: World = first_core.world
         self._length: int = first_core.length
-        if max_episode_steps not in (None, self._length):      # gymnasium passes that of a spec
+        if max_episode_steps not in (None, self._length):      # gymnasium passes the spec's value
             raise ValueError("max_episode_steps must be None or the steps of an episode, "
                              f"{self._length}, got {max_episode_steps!r}")
         self.single_observation_space = first_core.observation_space
@@ -285,7 +285,7 @@ class EpisodeVectorEnv(gym.vector.VectorEnv[Any, np.ndarray, np.ndarray]):
 
     def reset(self, *, seed: int | list[int | None] | None = None,
               options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        """Begin the episodes seed, seed + 1, …, or those of a list; or random training episodes."""
+        """Begin the episodes seed, seed + 1, …, or a list of seeds, or random training episodes."""
         if options and "reset_mask" in options:
             raise ValueError("options must not hold 'reset_mask': all environments begin and end "
                              "together")

@@ -32,7 +32,7 @@ class PrivilegedInfo(NamedTuple):
     """Data of the episode that only oracles are given."""
 
     voltages: np.ndarray
-    """(T, L) V, the whole episode"""
+    """(T, L) V, all steps of the episode"""
     currents: np.ndarray
     """(T, L) A (A/m in 2D)"""
     transport: Callable[[int], Transport]
@@ -42,7 +42,7 @@ class PrivilegedInfo(NamedTuple):
 
 
 class EstimationCore(EpisodeCore):
-    """B episodes in which the injections are those of the world's cycle, and actions estimates."""
+    """B episodes with the world's cycle of injections, whose actions are estimates."""
 
     def __init__(self, world: World, lag: int) -> None:
         super().__init__(world)
@@ -135,7 +135,7 @@ class EstimationEnv(EpisodeEnv):
 
     `reset(seed=s)` starts episode s; the splits train, dev and test have separate ranges of seeds.
     Without a seed, a random training episode is drawn, from few at first. The first use of a seed
-    simulates its truth and stores it in the cache; `eitbench bank` does so in advance.
+    simulates the ground truth and caches it; `eitbench bank` does so in advance.
 
     ## Episode End
 
@@ -145,8 +145,8 @@ class EstimationEnv(EpisodeEnv):
 
     | name | default | meaning |
     |---|---|---|
-    | `lag` | that of the id | integer from 0 to T − 1, or "all" (= T − 1): the whole record first |
-    | `assume` | that of the id | dict of wrong assumptions on the flow in the task's model |
+    | `lag` | set by the id | integer from 0 to T − 1, or "all" (= T − 1): all measurements first |
+    | `assume` | set by the id | dict of wrong assumptions on the flow in the task's model |
     | `variant` | None | name of a robustness variant, as "strong-slugs" of `eitbench/Pipe2D-v0` |
     | `world` | None | numbers to change, as in `{"instrument": {"noise_relative": 0.02}}` |
     | `episodes` | None | training episodes of unseeded resets; None: 1, 8, … up to 1000 |

@@ -21,9 +21,8 @@ class InjectionEnv(EpisodeEnv):
 
     `Discrete(n)`: the number of an electrode pair (0, 1), (0, 2), … (`Rules.pairs`); the
     current enters at the first electrode and leaves at the second. With a budget, the last action
-    is no injection. With `instrument.current_norm`, `Box`: a current for each electrode,
-    relative to the
-    instrument's current, see `Rules`.
+    omits the injection. With `instrument.current_norm`, `Box`: a current for each electrode,
+    relative to the instrument's current, see `Rules`.
 
     ## Observation Space
 
@@ -33,11 +32,10 @@ class InjectionEnv(EpisodeEnv):
 
     ## Rewards
 
-    For each scored state the difference ∫(ĉ_bh − c_t)² dΩ / ∫c_t² dΩ − ∫(ĉ_t − c_t)² dΩ / ∫c_t² dΩ
-    between the error of the homogeneous estimate, which no injection changes, and that of the
-    filter; 0 for the other states. The score is ẽ_c (thesis 5.12), the mean of the second term;
-    where the world has a `region`, both integrals are over the region. With `estimator="none"` the
-    reward is 0.
+    For each scored state ∫(ĉ_bh − c_t)² dΩ / ∫c_t² dΩ − ∫(ĉ_t − c_t)² dΩ / ∫c_t² dΩ, the error of
+    the homogeneous estimate, which no injection changes, minus the filter's error; 0 for the other
+    states. The score is ẽ_c (thesis 5.12), the mean of the second term; where the world has a
+    `region`, both integrals are over the region. With `estimator="none"` the reward is 0.
 
     ## Starting State
 
@@ -56,8 +54,8 @@ class InjectionEnv(EpisodeEnv):
     |---|---|---|
     | `estimator` | "reduced" | reduced filter for training; "full": exact, for scores; "none" |
     | `observation` | "scaled" | or "raw" |
-    | `gate` | that of the id | the filter rejects readings beyond this many standard deviations |
-    | `inflow` | that of the id | inflow prior: "white" noise (Table 5.1), or "learned" |
+    | `gate` | set by the id | the filter rejects innovations beyond this many standard deviations |
+    | `inflow` | set by the id | inflow prior: "white" noise (Table 5.1), or "learned" |
     | `variant` | None | name of a robustness variant of the id |
     | `world` | None | numbers to change, as in `{"schedule": {"budget": 20}}` |
     | `episodes` | None | training episodes of unseeded resets; None: 1, 8, … up to 1000 |
@@ -86,14 +84,14 @@ class InjectionEnv(EpisodeEnv):
         return self.core.t, mean[0], spread[0], self.core.currents[0]
 
     def action_masks(self) -> np.ndarray:
-        """(actions,) bool: numbered actions that have an effect; with the budget spent only the
-        last one, no injection."""
+        """(actions,) bool: numbered actions that have an effect; only the last one, without an
+        injection, when the budget is used up."""
         return self.core.action_masks()[0]
 
     @property
     def error(self) -> float | None:
-        """Relative error (5.12) of the present estimate; None if the state is not scored or there
-        is no estimator. ``ResetNeeded`` before the first episode."""
+        """Relative error (5.12) of the present estimate; None without an estimator or if the state
+        is not scored. ``ResetNeeded`` before the first episode."""
         self.require_reset("error")
         error = float(self.core.errors()[0])
         return None if np.isnan(error) else error

@@ -29,9 +29,9 @@ def flatten_scaled(rules: Rules, observation: Observation) -> np.ndarray:
     """Flatten a raw observation into one array (..., d), float32, each entry about between −1 and 1
     and never beyond ±5.
 
-    In this order: voltages, recent currents, innovations, mean and std on the grid, doubt, what is
-    left, and where the flow is estimated its velocity and standard deviation; without the first
-    frame.
+    In this order: voltages, recent currents, innovations, mean and std on the grid, fault scores,
+    remaining steps and injections, and if the flow is estimated its velocity and standard
+    deviation; the first frame is omitted.
     """
     world = rules.world
     level = world.expected_concentration
@@ -51,8 +51,8 @@ def flatten_scaled(rules: Rules, observation: Observation) -> np.ndarray:
 
 
 class InjectionCore(EpisodeCore):
-    """B episodes: injections in, noisy voltages out; the reward is the decrease of the error from
-    the homogeneous estimate to that of a filter.
+    """B episodes: injections in, noisy voltages out; the reward is the error of the homogeneous
+    estimate minus the error of a filter.
 
     Parameters
     ----------
@@ -120,9 +120,9 @@ class InjectionCore(EpisodeCore):
         L = world.currents.shape[1]
         T = world.n_steps
         self.t = self.n_initial
-        """injections so far, including those of the first frame"""
+        """injections so far, including the first frame"""
         self.n_injections = np.zeros(B, dtype=int)
-        """(B,) injections that the agents have made of a budget"""
+        """(B,) injections that the agents have used of a budget"""
         self._resistance = np.empty((T, B, L, L))
         self._draws = np.empty((T, B, L))
         self._deviations, self._squares, self._totals = np.empty((3, B, T))
@@ -156,7 +156,7 @@ class InjectionCore(EpisodeCore):
             self._squares[b, k] = counted.square[k]
             self._totals[b, k] = counted.moment[k].sum(axis=1, dtype=float)
             if self._filters_type:
-                # all rows, so that the bits of a product of matrices do not depend on their number
+                # all rows, so that rounding of the matrix product does not depend on their number
                 moment = np.zeros((self.world.n_steps, counted.moment.shape[1]), np.float32)
                 moment[k] = counted.moment[k]
                 moments.append(self._filters_type.project(self.rules, moment))
@@ -203,8 +203,8 @@ class InjectionCore(EpisodeCore):
         return np.asarray(rewards)
 
     def errors(self) -> np.ndarray:
-        """(B,) relative errors (5.12) of the present estimates, NaN where the state is not scored
-        or there is no estimator."""
+        """(B,) relative errors (5.12) of the present estimates, NaN without an estimator or where
+        the state is not scored."""
         if self.t <= self.world.warm_up or not self._filters_type:
             return np.full(len(self.n_injections), np.nan)
         k = self.t - 1
@@ -227,8 +227,8 @@ class InjectionCore(EpisodeCore):
         return self._filters.innovations()
 
     def action_masks(self) -> np.ndarray:
-        """(B, actions) bool: numbered actions that have an effect; with the budget spent only the
-        last one, no injection."""
+        """(B, actions) bool: numbered actions that have an effect; only the last one, without an
+        injection, when the budget is used up."""
         if self._table is None:
             raise ValueError("action_masks is for environments whose actions are numbers; here "
                              "they are currents")

@@ -1,4 +1,4 @@
-"""Surfaces of equal concentration in a mesh of tetrahedra, and their picture."""
+"""Surfaces of equal concentration in a mesh of tetrahedra, and their projection to an image."""
 
 from __future__ import annotations
 
@@ -12,17 +12,17 @@ from eitbench.physics.cem import CompleteElectrodeModel
 
 HIGH_COLOUR, LOW_COLOUR = "#e08e0b", "#2f6db5"
 _EYE = -np.linalg.qr(np.array([[0.30, 0.0, 1.0], [0.22, 1.0, 0.0], [0.9, -0.3, -0.3]]).T)[0].T
-"""Rows: what is right, up and near on the picture; the pipe's axis z runs to the right."""
+"""Rows: directions to the right, up and to the viewer; the pipe's axis z runs to the right."""
 
 
 def isosurface(mesh: Mesh, values: np.ndarray, level: float) -> np.ndarray:
     """(k, 3, 3) corners in m of triangles on which linearly interpolated ``values`` are ``level``.
 
-    A tetrahedron with one corner on either side of the level is cut in a triangle, one with two in
-    a quadrilateral, given as two triangles.
+    A tetrahedron with one corner on either side of the level is cut in a triangle, a tetrahedron
+    with two in a quadrilateral, given as two triangles.
     """
     above = values > level
-    # corners above the level come first
+    # corners above the level first
     order = np.argsort(~above[mesh.cells], axis=1, kind="stable")
     cells = np.take_along_axis(mesh.cells, order, axis=1)
     count = above[mesh.cells].sum(axis=1)
@@ -41,7 +41,7 @@ def isosurface(mesh: Mesh, values: np.ndarray, level: float) -> np.ndarray:
 
 
 def draw_isosurfaces(axes: Axes, mesh: Mesh, values: np.ndarray, poor: float, rich: float) -> None:
-    """Surfaces of ``poor`` (blue) and ``rich`` (orange) mol/m³ in the outline of the pipe."""
+    """Draw the surfaces of ``poor`` (blue) and ``rich`` (orange) mol/m³ in the pipe's outline."""
     surfaces = [isosurface(mesh, values, level) for level in (poor, rich)]
     colours = np.repeat([LOW_COLOUR, HIGH_COLOUR], list(map(len, surfaces)))
     _draw(axes, np.concatenate(surfaces), colours, 0.5)
@@ -50,7 +50,7 @@ def draw_isosurfaces(axes: Axes, mesh: Mesh, values: np.ndarray, poor: float, ri
 
 def draw_electrodes_in_space(axes: Axes, cem: CompleteElectrodeModel, currents: np.ndarray,
                              colours: tuple[str, str, str]) -> None:
-    """Electrodes on the wall in the colours of (source, sink, idle)."""
+    """Draw the electrodes on the wall in the colours of (source, sink, idle)."""
     idle = np.concatenate([cem.mesh.points[facets] for facets in cem.electrodes])
     _draw(axes, idle, np.repeat(colours[2], len(idle)), 0.3)
     for k in np.flatnonzero(currents):
@@ -60,7 +60,7 @@ def draw_electrodes_in_space(axes: Axes, cem: CompleteElectrodeModel, currents: 
 
 
 def _draw(axes: Axes, triangles: np.ndarray, colours: np.ndarray, alpha: float) -> None:
-    """Triangles (k, 3, 3) in m as `_EYE` sees them, the furthest first, shaded by their facing."""
+    """Draw triangles (k, 3, 3) in m projected by `_EYE`, the furthest first, with shading."""
     if not len(triangles):
         return
     seen = 100.0 * triangles @ _EYE.T
@@ -74,7 +74,7 @@ def _draw(axes: Axes, triangles: np.ndarray, colours: np.ndarray, alpha: float) 
 
 
 def _outline(axes: Axes, mesh: Mesh) -> None:
-    """Both ends of the pipe and two lines between them."""
+    """Draw both ends of the pipe and two lines between them."""
     low, high = mesh.points.min(axis=0), mesh.points.max(axis=0)
     angle = np.linspace(0.0, 2.0 * np.pi, 61)
     radius = 0.5 * (high - low)[0]

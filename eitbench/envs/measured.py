@@ -30,12 +30,12 @@ from eitbench.physics.stationary import StationaryTransport
 from eitbench.worlds.task import Task
 
 NOISE_FRAMES = 1000
-"""The noise is estimated from the first frames, at most so many."""
-NO_REFERENCE = ("There is no homogeneous frame: the frame is its own reference, so that images "
-                "show no target, and nothing is scored. The correction 'none' gives an absolute "
-                "image.")
+"""Largest number of first frames from which the noise is estimated."""
+NO_REFERENCE = ("A homogeneous frame is missing: the only frame is used as its own reference, so "
+                "images show no target, and nothing is scored. The correction 'none' gives an "
+                "absolute image.")
 WITHHOLDING_SEEDS = 100_000
-"""Size of a split of seeds: ``test:3``, ``dev:3`` and ``train:3`` withhold the same readings."""
+"""Size of a split of seeds: ``test:3``, ``dev:3`` and ``train:3`` share their withheld mask."""
 
 
 class MeasuredEnv(FixedLengthEnv):
@@ -43,25 +43,25 @@ class MeasuredEnv(FixedLengthEnv):
 
     ## Action Space
 
-    At step t = 1 … T the action is the estimate of the state at the t-th reading: the concentration
-    at the nodes of `task.mesh` in mol/m³. Where the velocity is estimated too (`task.velocity`),
-    its parameters in m/s follow.
+    At step t = 1 … T the action is the estimate of the state at the t-th injection: the
+    concentration at the nodes of `task.mesh` in mol/m³. Where the velocity is estimated too
+    (`task.velocity`), its parameters in m/s follow.
 
     ## Observation Space
 
     A `Dict` with the voltages, (M,) V, and currents, (L,) A, of the active injection. Channels that
-    are withheld or never measured are 0; the mask of the task's `MeasurementModel` names them. A
-    single measurement that was lost, or is a spike, is NaN.
+    are withheld or never measured are 0; the mask of the task's `MeasurementModel` excludes them.
+    A single measurement that was lost, or is a spike, is NaN.
 
     ## Rewards
 
-    −mean ((reading − predicted)/std)² over the withheld readings of the active injection, 0 in the
-    first frame. For a target at rest, all withheld readings score the last estimate.
+    −mean ((measured − predicted)/std)² over the withheld measurements of the active injection, 0 in
+    the first frame. For a stationary target, all withheld measurements score the last estimate.
 
     ## Starting State
 
-    `reset(seed=s)` draws the withheld fraction of the readings of each injection, the same at each
-    of its uses; without a seed, the random generator of the environment draws s.
+    `reset(seed=s)` draws the withheld channels of each injection, the same at each of its uses;
+    without a seed, the random generator of the environment draws s.
 
     ## Episode End
 
@@ -73,14 +73,14 @@ class MeasuredEnv(FixedLengthEnv):
     |---|---|---|
     | `file` | | a file for `eitbench.measured.read`, or `Measurements` |
     | `vessel` | | a file or mapping for `read_vessel`, or a `VesselConfig` |
-    | `withheld` | 0.1 | withheld fraction of the readings, from 0 to 0.5 |
+    | `withheld` | 0.1 | withheld fraction of the measurements, from 0 to 0.5 |
     | `moves` | None | whether the target moves; None: with two complete frames or more, or a flow |
     | `correction` | "offset" | of the misfit on homogeneous fluid; see `calibrate` |
     | `homogeneous_frames` | 1 | number of first frames that replace a missing reference |
     | `render_mode` | None | "rgb_array": last estimate, standard deviation, active electrodes |
 
-    and those of `task_from_measurements`. A case, such as `eitbench/Measured-iirc-v0`, fixes all
-    but `file` and `render_mode`.
+    and the arguments of `task_from_measurements`. A case, such as `eitbench/Measured-iirc-v0`,
+    fixes all but `file` and `render_mode`.
     """
 
     metadata = {"render_modes": RENDER_MODES, "render_fps": 8}  # noqa: RUF012 (gymnasium's form)
@@ -143,11 +143,11 @@ class MeasuredEnv(FixedLengthEnv):
         self.action_space: spaces.Box = spaces.Box(-limit, limit, dtype=np.float64)
 
     def _withhold(self, seed: int) -> None:
-        """Draw the withheld readings, and build the task without them."""
+        """Draw the withheld measurements, and build the task without them."""
         if seed == self._seed:
             return
         self.withheld_mask = sample_withheld(self.available, self.withheld, seed)
-        """(K, M) bool: readings that the agent is not shown"""
+        """(K, M) bool: measurements that the observations omit"""
         self.task: Task = task_from_measurements(
             self.vessel, self.calibration, self.measurements,
             mask=self.available & ~self.withheld_mask,
@@ -165,8 +165,8 @@ class MeasuredEnv(FixedLengthEnv):
 
     def reset(self, *, seed: int | None = None,
               options: dict[str, Any] | None = None) -> tuple[Observation, dict[str, Any]]:
-        """Begin the measurements; the seed, or without one a random number, draws the withheld
-        readings."""
+        """Begin the measurements; the seed, or without one a random number, determines the
+        withheld channels."""
         super().reset(seed=seed)
         if seed is None:
             seed = int(self.np_random.integers(WITHHOLDING_SEEDS))
@@ -176,7 +176,7 @@ class MeasuredEnv(FixedLengthEnv):
         return self._observe(), {"step": 1}
 
     def step(self, action: np.ndarray) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
-        """Take the estimate (n,) in mol/m³ of the state at the last readings, followed by the
+        """Take the estimate (n,) in mol/m³ of the state at the last measurement, followed by the
         parameters of the flow in m/s if the velocity is estimated."""
         if not 1 <= self._step <= self.episode_steps:
             raise gym.error.ResetNeeded(RESET_NEEDED)
@@ -213,13 +213,13 @@ class MeasuredEnv(FixedLengthEnv):
                                                            self._electrodes)]
 
     def scoring_steps(self, t: int) -> range:
-        """Return the injections, 1 … T, whose withheld readings score an estimate at t."""
+        """Return the injections, 1 … T, whose withheld measurements score an estimate at t."""
         if isinstance(self.task.transport, StationaryTransport):
             return range(1, self.episode_steps + 1) if t == self.episode_steps else range(0)
         return range(t, t + 1) if t > self.task.warm_up else range(0)
 
     def withheld_residuals(self, t: int, estimate: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Residuals of an estimate (n,) at the readings withheld at t = 1 … T: relative to the
+        """Residuals of an estimate (n,) in the measurements withheld at t = 1 … T: relative to the
         standard deviation of their noise, and in V."""
         residuals = self.residuals(t, estimate)
         is_scored = (self.withheld_mask[self.measurements.injection_index[t - 1]]
@@ -228,12 +228,12 @@ class MeasuredEnv(FixedLengthEnv):
         return residuals[is_scored], (residuals * std)[is_scored]
 
     def residuals(self, t: int, estimate: np.ndarray) -> np.ndarray:
-        """(M,) residuals of an estimate (n,) at all readings of t = 1 … T, relative to the
+        """(M,) residuals of an estimate (n,) in all measurements of t = 1 … T, relative to the
         standard deviation of their noise; NaN where nothing was measured."""
-        reading = self.measurements.voltages[t - 1]
+        measured = self.measurements.voltages[t - 1]
         k = self.measurements.injection_index[t - 1]
         predicted = self._full_model.voltages(estimate, self.measurements.currents[k][None])[0]
-        residuals = (reading - predicted) / self.task.noise.std(np.nan_to_num(reading))
+        residuals = (measured - predicted) / self.task.noise.std(np.nan_to_num(measured))
         found: np.ndarray = np.where(self.available[k], residuals, np.nan)
         return found
 
@@ -247,7 +247,7 @@ class MeasuredEnv(FixedLengthEnv):
 
 def case_env(case: Path | str, file: Path | str | None = None,
              render_mode: str | None = None) -> MeasuredEnv:
-    """Build the environment of a case; ``ValueError`` says which ``file`` is missing."""
+    """Build the environment of a case; ``ValueError`` names a ``file`` that is missing."""
     found = read_case(case)
     env = MeasuredEnv(found.measurements(file), dict(found.vessel), render_mode=render_mode,
                       **found.options)

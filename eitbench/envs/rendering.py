@@ -1,4 +1,4 @@
-"""Pictures of an episode: fields on triangles, electrodes, the injected pair."""
+"""Images of an episode: fields on triangles, electrodes, the injected pair."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ def draw_frame(task: Task, truth_mesh: Mesh, truth: np.ndarray, estimate: np.nda
                spread: np.ndarray | None, currents: np.ndarray, time: float,
                region: tuple[float, float] | None = None) -> np.ndarray:
     """(height, width, 3) uint8: truth and estimate in one colour scale, its standard deviation and
-    electrodes; panels of pipes below each other, in 3D with isosurfaces, those of tanks in a row.
+    electrodes; panels of pipes are below each other, in 3D with isosurfaces, of tanks in a row.
 
     Parameters
     ----------
@@ -95,8 +95,8 @@ def draw_frame(task: Task, truth_mesh: Mesh, truth: np.ndarray, estimate: np.nda
     where = {"location": "bottom", "aspect": 40} if tank else {"aspect": 30}
     figure.colorbar(field, ax=panels[:2], label="concentration / (mol/m³)", extend="both", **where)
     if spread is None:
-        panels[2].text(0.5, 0.5, "no spread claimed", transform=panels[2].transAxes, ha="center",
-                       va="center")
+        panels[2].text(0.5, 0.5, "no reported uncertainty", transform=panels[2].transAxes,
+                       ha="center", va="center")
     shown = np.zeros(task.mesh.n_nodes) if spread is None else spread
     colours, label = ("Greys", "") if spread is None else (STD_COLORMAP, "std / (mol/m³)")
     draw = draw_field(panels[2], task.mesh, shown, 0.0, spread_high, colours)

@@ -103,7 +103,7 @@ def read_eidors(path: Path, name: str | None = None,
                 reference: str | None = None) -> Measurements:
     """Read the frames (256, F) of the variable ``name``, by default the first known one, such as
     ``v_rotate`` of iirc_data_2006.mat or ``zc_demo3`` of montreal_data_1995.mat, and homogeneous
-    frames of the variable ``reference``, by default the one that belongs to it.
+    frames of the variable ``reference``, by default as in `EIDORS_REFERENCES`.
 
     Row 16·i + j of a frame is the voltage between electrodes j and j + 1 while 1 mA (assumed)
     enters at i and leaves at i + 1, in units of the instrument. The real part of complex values is

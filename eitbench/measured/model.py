@@ -78,7 +78,7 @@ class MeasurementModel:
 
 def available_channels(measurements: Measurements) -> np.ndarray:
     """Return (K, M) bool: channels that are measured at least at every second use of their
-    injection. ``ValueError`` if there are none."""
+    injection. ``ValueError`` if all are missing."""
     finite = np.isfinite(measurements.voltages)
     available = np.zeros((len(measurements.currents), len(measurements.matrix)), dtype=bool)
     for k in np.unique(measurements.injection_index):

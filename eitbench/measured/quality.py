@@ -36,8 +36,8 @@ N_NAMED_SPIKES = 3
 
 
 def find_spikes(measurements: Measurements) -> np.ndarray:
-    """Return (T, M) bool: single voltages far from those of the same channel in the uses of the
-    injection before and after."""
+    """Return (T, M) bool: single voltages that differ by far from the same channel's voltages in
+    the uses of the injection before and after."""
     spikes = np.zeros(measurements.voltages.shape, dtype=bool)
     for k in np.unique(measurements.injection_index):
         uses = np.flatnonzero(measurements.injection_index == k)
@@ -131,7 +131,7 @@ def _order_warnings(measurements: Measurements, calibration: Calibration,
         currents = measurements.currents[:, injecting]
         matrix = measurements.matrix[:, measuring]
         passive = finite & (np.abs(currents) @ np.abs(matrix).T == 0.0)
-        # where all electrodes inject, only channels near zero remain, whose misfit says little
+        # where all electrodes inject, only channels near zero remain: their misfit is mostly noise
         used = passive if 2 * passive.sum() > finite.sum() else finite
         y, x = calibration.mean_voltages[used], (currents @ R @ matrix.T)[used]
         return float(np.linalg.norm(y - (x @ y) / (x @ x) * x) / np.linalg.norm(y))

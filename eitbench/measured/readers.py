@@ -80,10 +80,10 @@ def read_sciospec(path: Path, *, frequency: float | None = None) -> Measurements
     """Read one ``.eit`` file, or all files of a folder in the order of their names.
 
     The voltages are the real parts of the potentials relative to the mean of all electrodes, or of
-    the differences of neighbouring channels, as the header's measurement mode tells. The current
-    enters at the first electrode of a pair with the header's amplitude in A. The injections of a
-    frame are evenly spaced until the next frame. A file of several frequencies needs
-    ``frequency`` in Hz, the one to read.
+    the differences of neighbouring channels, by the header's measurement mode. The current enters
+    at the first electrode of a pair with the header's amplitude in A. The injections of a frame
+    are evenly spaced until the next frame. A file of several frequencies needs ``frequency`` in Hz
+    to select one.
     """
     files = sorted(path.glob("*.eit")) if path.is_dir() else [path]
     if not files:
@@ -205,8 +205,8 @@ def read_table(path: Path, *, electrodes: int, current: float, time_step: float 
     reference_rows : int
         Number of first rows that become the reference: complete frames of homogeneous fluid.
     readings : "potentials" or "neighbours", optional
-        Whether a voltage is the potential of its electrode, or its difference from the next
-        electrode. Default: differences if all their titles are such as ``U1-U2``.
+        A voltage is the potential of its electrode, or its difference from the next electrode.
+        Default: differences if all their titles are such as ``U1-U2``.
     """
     if readings not in (None, *TABLE_VOLTAGES):
         raise ValueError(f"readings must be one of {', '.join(TABLE_VOLTAGES)}, got {readings!r}")
@@ -289,8 +289,8 @@ def _table_options(table: Path) -> dict[str, Any]:
                  if each.is_file() and "kind" not in load_yaml(each, "table")), None)
     if path is None:
         raise ValueError("a table must be described by a YAML file of entries like 'electrodes: "
-                         f"16' and 'current: 0.001' (A), got no {table.name}.yml and no "
-                         f"{table.stem}.yml of a table beside {table}")
+                         f"16' and 'current: 0.001' (A), got neither {table.name}.yml nor a "
+                         f"{table.stem}.yml of a table in the folder of {table}")
     options = load_yaml(path, "table")
     names = set(signature(read_table).parameters) - {"path"}
     if not set(options) <= names:

@@ -60,7 +60,7 @@ def task_from_measurements(vessel: VesselConfig, calibration: Calibration,
     mask : (K, M) bool, optional
         Measurements that are visible to the estimator. Default: all complete channels.
     moves : bool
-        Whether the target moves.
+        True if the target moves.
     molar_conductivity : float
         Λ in S·m²/mol.
     model_error : float

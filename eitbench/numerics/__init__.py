@@ -1,1 +1,1 @@
-"""Floor 0: meshes, finite elements, sparse factorisation and compiled kernels."""
+"""Layer 0: meshes, finite elements, sparse factorisation and compiled kernels."""

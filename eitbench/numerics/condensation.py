@@ -115,13 +115,13 @@ class Condensation:
         return self._symmetric(factor[panel[-2]:panel[-1]])
 
     def _symmetric(self, columns: np.ndarray) -> np.ndarray:
-        """(..., m, m) from (..., m·m) with the lower triangle by columns."""
+        """Return (..., m, m) from (..., m·m) with the lower triangle by columns."""
         block = columns.reshape(*columns.shape[:-1], self.n_ports, self.n_ports)
         return np.triu(block) + np.swapaxes(np.triu(block, 1), -1, -2)
 
 
 def _filled(pattern: sp.csc_array) -> sp.csc_array:
-    """The Cholesky factor's pattern, as SuperLU finds it for a matrix on which nothing cancels."""
+    """Return the Cholesky factor's pattern, from SuperLU for a matrix without cancellation."""
     factors = factorise_no_pivot(_diagonally_dominant(pattern), "NATURAL")
     back = np.argsort(factors.perm_c)      # SuperLU may have postordered the elimination tree
     lower = factors.L.tocoo()
@@ -131,15 +131,15 @@ def _filled(pattern: sp.csc_array) -> sp.csc_array:
 
 
 def _parents(filled: sp.csc_array) -> np.ndarray:
-    """The elimination tree: the first row below the diagonal of each column, or −1."""
+    """Return the elimination tree: the first row below the diagonal of each column, or −1."""
     last = filled.indptr[1:] - filled.indptr[:-1] == 1
     return np.where(last, -1, filled.indices[np.minimum(filled.indptr[:-1] + 1, filled.nnz - 1)])
 
 
 def _postorder(parents: np.ndarray, n_last: int) -> np.ndarray:
-    """New position of each column, such that every subtree is consecutive.
+    """Return the new position of each column, such that every subtree is consecutive.
 
-    The ``n_last`` last columns stay.
+    The ``n_last`` last columns keep their positions.
     """
     n = len(parents) - n_last
     parent = [p if 0 <= p < n else n for p in parents[:n].tolist()]
@@ -148,7 +148,7 @@ def _postorder(parents: np.ndarray, n_last: int) -> np.ndarray:
         size[parent[j]] += size[j]
     rank = list(range(len(parents)))
     begin = [0] * (n + 1)
-    for j in reversed(range(n)):                  # a column's place is the end of its subtree's
+    for j in reversed(range(n)):                  # a column has the last position of its subtree
         begin[j] = begin[parent[j]]
         begin[parent[j]] += size[j]
         rank[j] = begin[j] + size[j] - 1
@@ -156,7 +156,7 @@ def _postorder(parents: np.ndarray, n_last: int) -> np.ndarray:
 
 
 def _supernodes(filled: sp.csc_array, n_last: int) -> tuple[np.ndarray, ...]:
-    """start, first_row, rows, panel, owner as in `eitbench.numerics.kernels`.
+    """Return start, first_row, rows, panel, owner as in `eitbench.numerics.kernels`.
 
     The ``n_last`` last columns are one supernode.
     """
@@ -178,7 +178,7 @@ def _supernodes(filled: sp.csc_array, n_last: int) -> tuple[np.ndarray, ...]:
 
 def _multifrontal_sizes(start: np.ndarray, first_row: np.ndarray, rows: np.ndarray,
                         _panel: np.ndarray, owner: np.ndarray) -> tuple[np.ndarray, int, int]:
-    """Children of each supernode, and entries of the largest front and of the fullest stack."""
+    """Return the children of each supernode, and entries of the largest front and stack."""
     width, height = np.diff(start), np.diff(first_row)
     parent = owner[rows[first_row[:-2] + width[:-1]]]             # the owner of the first row below
     children = np.bincount(parent, minlength=len(width))
@@ -195,10 +195,10 @@ def _multifrontal_sizes(start: np.ndarray, first_row: np.ndarray, rows: np.ndarr
 
 
 def _nested_dissection(pattern: sp.csc_array, places: np.ndarray) -> np.ndarray:
-    """Position of each unknown when a body is cut in two again and again.
+    """Return the position of each unknown in a nested dissection.
 
-    Every cut comes after its two sides; it is the smallest of some across the axes of ``places``
-    (n, d).
+    Every cut comes after its two sides; it has the lowest cost of some cuts across the axes of
+    ``places`` (n, d).
     """
     graph = sp.csr_array(pattern)
     order: list[np.ndarray] = []
@@ -217,7 +217,7 @@ def _nested_dissection(pattern: sp.csc_array, places: np.ndarray) -> np.ndarray:
                 for side in (low, ~low):
                     cut = side & ((within @ (~side).astype(float)) > 0)
                     rest = np.array([(low & ~cut).sum(), (~low & ~cut).sum()])
-                    cost = cut.sum() * (2 * rest.max() / len(part))      # small, and in the middle
+                    cost = cut.sum() * (2 * rest.max() / len(part))      # small and central cuts
                     if rest.min() > 0 and cost < smallest:
                         best = (part[low & ~cut], part[~low & ~cut], part[cut])
                         smallest = cost
@@ -231,7 +231,7 @@ def _nested_dissection(pattern: sp.csc_array, places: np.ndarray) -> np.ndarray:
 
 
 def _minimum_degree(pattern: sp.csc_array) -> np.ndarray:
-    """Position of each unknown in a fill-reducing order."""
+    """Return the position of each unknown in a fill-reducing order."""
     factors = factorise_no_pivot(_diagonally_dominant(pattern), "MMD_AT_PLUS_A")
     return factors.perm_c.astype(np.int64)
 
@@ -248,7 +248,7 @@ def _sorted_pattern(places: tuple[np.ndarray, np.ndarray], shape: tuple[int, int
 
 
 def _diagonally_dominant(pattern: sp.csc_array) -> sp.csc_array:
-    """A matrix with this symmetric pattern that any ordering factorises."""
+    """Return a matrix with this symmetric pattern that can be factorised in any order."""
     ones = pattern.copy()
     ones.data = np.full(pattern.nnz, -1.0)
     return (ones + sp.diags_array(2.0 + np.diff(pattern.indptr).astype(float))).tocsc()

@@ -1,18 +1,17 @@
 """Compiled kernels: sparse Cholesky and LU factors on a fixed pattern, products of gradients, and
 sub-steps of a linear evolution.
 
-All that needs numba is in this file; `eitbench.numerics.compiled` imports it when it is needed.
+All code that requires numba is in this file, which `eitbench.numerics.compiled` imports on demand.
 
 The factor is stored in supernodes, runs of columns with the same pattern below them: supernode s
 holds the columns start[s] … start[s+1]−1 and the rows rows[first_row[s] : first_row[s+1]], as a
-dense panel, column after column, from panel[s] on. Of the last supernode only its right-hand side
-is made: the Schur complement of all before.
+dense panel, column after column, from panel[s] on. For the last supernode only the right-hand side
+is computed: the Schur complement of all earlier ones.
 
-Loops over eight neighbours inside one array are not vectorised by the compiler, since it cannot
-know that they do not overlap. So the kernels speak of eight doubles at a time, in a type that
-numba lacks and a handful of intrinsics for it; the same arithmetic then runs 3 to 5 times faster.
-They stand in this file because numba keeps compiled code by the file of the kernel: elsewhere, a
-change in them would go unnoticed.
+The compiler does not vectorise loops over eight neighbours inside one array, since it cannot prove
+that they do not overlap. Therefore the kernels process eight doubles at a time, by intrinsics for a
+type that numba lacks, which is 3 to 5 times faster. The intrinsics are in this file because numba
+caches compiled code per file of the kernel: it would not notice a change in another file.
 """
 
 from __future__ import annotations
@@ -27,8 +26,8 @@ from numba.extending import intrinsic, models, register_model
 
 WIDTH = 8
 WIDE = 32
-"""Lanes where there are hundreds of right-hand sides: a lane's additions wait for each other, so
-several registers are added to at once; more do not fit where one holds four doubles."""
+"""Lanes for hundreds of right-hand sides. The additions of a lane depend on each other, so several
+registers are used in turn; more do not fit if a register holds four doubles."""
 
 
 class Lanes(types.Type):
@@ -61,7 +60,7 @@ def _loader(lanes):
 def _splatter(lanes):
     @intrinsic
     def splat(_typing, number):
-        """The same number in every lane."""
+        """number in every lane"""
         def code(_context, builder, _signature, arguments):
             nothing = ir.Constant(lanes.vector, ir.Undefined)
             first = builder.insert_element(nothing, arguments[0], ir.Constant(ir.IntType(32), 0))
@@ -166,9 +165,9 @@ def factorise(start, first_row, rows, panel, owner, first_entry, slot, values, f
                 if rows[rows_d + a] < start[s + 1]:
                     end = a + 1
             width_d = start[d + 1] - start[d]
-            for b in range(begin, end, 2):      # two columns at a time: what is loaded serves both
+            for b in range(begin, end, 2):      # two columns at a time, which share loaded values
                 twin = min(b + 1, end - 1)
-                # may read beyond the panel, into numbers that are not used
+                # may read numbers beyond the panel, which are not used
                 for a in range(b, height_d, WIDTH):
                     total = splat(0.0)
                     other = splat(0.0)
@@ -213,7 +212,8 @@ def factorise(start, first_row, rows, panel, owner, first_entry, slot, values, f
 
 @njit(inline="always")
 def _enlist(s, end, rows_s, height, rows, owner, head, after, done):
-    """Supernode s is done with its first ``end`` rows: the owner of the next one will need it."""
+    """Mark the first ``end`` rows of supernode s as done, and add s to the list of the supernode
+    that owns its next row."""
     done[s] = end
     if end < height:
         next_one = owner[rows[rows_s + end]]
@@ -224,11 +224,11 @@ def _enlist(s, end, rows_s, height, rows, owner, head, after, done):
 @njit(cache=True)
 def condense_lanes(start, first_row, rows, panel, children, first_entry, slot, values, front,
                    stack):
-    """The Schur complements of eight matrices side by side, left in ``front``.
+    """Compute the Schur complements of eight matrices in ``front``, in lanes.
 
-    The values of the eight lie next to each other. Multifrontal: the factor itself is not kept.
-    What a supernode leaves to its ancestors waits on a stack until its parent takes it, so that
-    all work is done in memory that the caches hold.
+    Corresponding values of the eight matrices are adjacent. Multifrontal: the factor itself is not
+    stored. The update matrix of a supernode stays on a stack until its parent adds it, so that the
+    working memory fits into the CPU caches.
     """
     n_super = len(start) - 1
     place = np.empty(start[-1], np.int64)
@@ -278,7 +278,7 @@ def condense_lanes(start, first_row, rows, panel, children, first_entry, slot, v
         at = begins[depth]
         waiting[depth] = s
         for j in range(width, height):
-            for i in range(j, height, 2):          # two rows at a time: what is loaded serves both
+            for i in range(j, height, 2):          # two rows at a time, which share loaded values
                 twin = min(i + 1, height - 1)
                 total = load(front, (j * height + i) * WIDTH)
                 other = load(front, (j * height + twin) * WIDTH)
@@ -289,7 +289,7 @@ def condense_lanes(start, first_row, rows, panel, children, first_entry, slot, v
                     other = subtract_product(other, load(front, (k + twin) * WIDTH), pivot)
                     k += height
                 store(stack, at * WIDTH, total)
-                store(stack, (at + 1) * WIDTH, other)    # if there is none it is overwritten
+                store(stack, (at + 1) * WIDTH, other)    # overwritten later if i is the last row
                 at += 2 if twin > i else 1
         depth += 1
         begins[depth] = at
@@ -319,9 +319,9 @@ def substitute_back(start, first_row, rows, panel, factor, solution):
 def subtract_gradient_products(cells, unknowns, gradient, fields, table, G):
     """Subtract `Sensitivity`'s integrals from ``table``, cell by cell.
 
-    Weighted gradients by a cell's unknowns (cells, vertices·dim, unknowns a cell); fields
-    (unknowns, width) and table (nodes, width, width), with width in multiples of eight; ``G`` is
-    room for twice (vertices, dim, width).
+    Weighted gradients by a cell's unknowns (cells, vertices·dim, unknowns per cell); fields
+    (unknowns, width) and table (nodes, width, width), with width a multiple of eight; ``G`` is
+    working memory of twice (vertices, dim, width).
     """
     n_cells, n_vertices = cells.shape
     n_rows, n_local = gradient.shape[1:]
@@ -329,8 +329,8 @@ def subtract_gradient_products(cells, unknowns, gradient, fields, table, G):
     width = fields.shape[1]
     u = fields.reshape(-1)
     out = table.reshape(-1)
-    size = dim * width                                   # numbers a vertex
-    shifted = n_vertices * size                          # where S + G_j begins, behind the G_j
+    size = dim * width                                   # numbers per vertex
+    shifted = n_vertices * size                          # start of S + G_j, behind the G_j
     for c in range(n_cells):
         for r in range(n_rows):
             for i in range(0, width, WIDTH):
@@ -347,7 +347,7 @@ def subtract_gradient_products(cells, unknowns, gradient, fields, table, G):
                 to = j * size + i
                 store(G, shifted + to, subtract_product(total, splat(-1.0), load(G, to)))
         for m in range(width):
-            for l in range(0, width, 2 * WIDTH):         # sixteen at a time, if there are so many
+            for l in range(0, width, 2 * WIDTH):         # sixteen at a time, if width allows
                 twin = min(l + WIDTH, width - WIDTH)
                 everywhere = splat(0.0)
                 everywhere_twin = splat(0.0)
@@ -399,12 +399,12 @@ def solve_lu(row_perm, column_perm, lower_pointer, lower_index, lower, upper_poi
 @njit(cache=True)
 def advance_wide(mass, explicit, implicit_inlet, lower, upper, scale, row_perm, unknown, inlet,
                  substeps, rate, state, before, slope, inflow, source, has_source, work):
-    """All sub-steps of `ConvectionDiffusion` for ``state`` (n, WIDE), in place.
+    """Compute all sub-steps of `ConvectionDiffusion` for ``state`` (n, WIDE), in place.
 
     Matrices are (pointers, indices, values) by rows: L and U in the order of elimination, in which
-    row r of the others stands at row_perm[r], and node unknown[i] is the i-th unknown. Blocks
-    (…, WIDE) are flattened: the inflow at first and what it changes by in a sub-step, room for the
-    present one, f if there is one (``has_source``), and room to work.
+    row r of the others has the position row_perm[r], and node unknown[i] is the i-th unknown.
+    Blocks (…, WIDE) are flattened: initial inflow ``before``, its change ``slope`` per sub-step,
+    memory for the present ``inflow``, ``source`` f if ``has_source``, and working memory.
     """
     for k in range(substeps + 1):
         time = float(k) if k else 0.5
@@ -421,7 +421,7 @@ def advance_wide(mass, explicit, implicit_inlet, lower, upper, scale, row_perm, 
 
 @njit
 def _right_side(matrix, rate, implicit_inlet, weight, row_perm, state, inflow, source, work):
-    """rate·(matrix c) − I c_in + weight·f, in the order of elimination."""
+    """Compute rate·(matrix c) − I c_in + weight·f, in the order of elimination."""
     for r in range(len(row_perm)):
         total = times(splat_wide(rate), _row_product(matrix, r, state))
         given = _row_product(implicit_inlet, r, inflow)
@@ -433,7 +433,7 @@ def _right_side(matrix, rate, implicit_inlet, weight, row_perm, state, inflow, s
 
 @njit
 def _substitute(lower, upper, scale, unknown, work, state):
-    """Solve with L and U, and put each unknown where it belongs."""
+    """Solve with L and U, and write each unknown to its node."""
     for i in range(len(scale)):
         store(work, i * WIDE, _rest(lower, i, work))
     for i in range(len(scale) - 1, -1, -1):
@@ -444,7 +444,7 @@ def _substitute(lower, upper, scale, unknown, work, state):
 
 @njit(inline="always")
 def _row_product(matrix, r, block):
-    """Row r times a block; product and sum are rounded apart, as scipy rounds them."""
+    """Multiply row r by a block; product and sum are rounded separately, as in scipy."""
     pointer, index, value = matrix
     total = splat_wide(0.0)
     for e in range(pointer[r], pointer[r + 1]):
@@ -454,7 +454,7 @@ def _row_product(matrix, r, block):
 
 @njit(inline="always")
 def _rest(matrix, i, block):
-    """Row i of a block less row i of a matrix times the block, rounded as in `solve_lu`."""
+    """Return row i of a block minus row i of a matrix times the block, rounded as in `solve_lu`."""
     pointer, index, value = matrix
     total = load_wide(block, i * WIDE)
     for e in range(pointer[i], pointer[i + 1]):

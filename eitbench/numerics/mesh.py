@@ -52,7 +52,7 @@ class Mesh:
             raise ValueError(f"points must all belong to a cell; {unused.size} do not, "
                              f"the first is node {unused[0]}")
         for name, value in (("points", points.copy()), ("cells", cells)):
-            value.setflags(write=False)  # meshes are shared, and much is derived from them
+            value.setflags(write=False)  # meshes are shared, and derived arrays are cached
             object.__setattr__(self, name, value)
         size = np.ptp(points, axis=0).max()
         flat = np.flatnonzero(self.volumes <= 1e-14 * size**d)
@@ -78,7 +78,7 @@ class Mesh:
 
     @cached_property
     def boundary_facets(self) -> np.ndarray:
-        """(n_facets, d) node numbers, sorted in each row, of the facets of one cell only."""
+        """(n_facets, d) node numbers, sorted in each row, of facets that belong to one cell."""
         return self._boundary[0]
 
     @cached_property
@@ -91,11 +91,11 @@ class Mesh:
         return facets[count == 1], first[count == 1] % len(self.cells)
 
     def facets_where(self, predicate: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
-        """(n_facets, d): boundary facets with all nodes in ``predicate(points) -> bool (k,)``."""
+        """Return boundary facets (n_facets, d) with all nodes in ``predicate(points) -> bool``."""
         return self.facets_of(np.asarray(predicate(self.points), dtype=bool))
 
     def facets_of(self, inside: np.ndarray) -> np.ndarray:
-        """(n_facets, d): boundary facets with all nodes ``inside``, (n_nodes,) bool."""
+        """Return boundary facets (n_facets, d) with all nodes ``inside``, (n_nodes,) bool."""
         return self.boundary_facets[inside[self.boundary_facets].all(axis=1)]
 
     @cached_property
@@ -118,8 +118,8 @@ class Mesh:
         ----------
         points : (k, d) float
             In m. A point outside the mesh (by rounding, or because a curved wall is a polygon here)
-            is moved to the nearest point of the boundary (in 3D, where that is on an edge of a
-            facet, to one nearly as near).
+            is moved to the nearest point of the boundary (in 3D, if the nearest point is on an
+            edge of a facet, to a point nearly as near).
         candidates : int
             Number of cells, nearest by centroid, to search first; other points are searched in all
             cells with a centroid near enough.
@@ -197,7 +197,7 @@ def _tree(corner: np.ndarray) -> tuple[cKDTree, float]:
 
 
 def validate_facets(name: str, facets: np.ndarray, mesh: Mesh) -> np.ndarray:
-    """``facets`` as an array of node numbers (k ≥ 1, d); else a ``ValueError`` with their name."""
+    """Return ``facets`` as node numbers (k ≥ 1, d); ``ValueError`` with their name otherwise."""
     facets = np.asarray(facets)
     if (facets.ndim != 2 or facets.shape[1] != mesh.dim or len(facets) == 0
             or not np.issubdtype(facets.dtype, np.integer)):
@@ -207,12 +207,12 @@ def validate_facets(name: str, facets: np.ndarray, mesh: Mesh) -> np.ndarray:
 
 
 def facet_set(facets: np.ndarray) -> set[tuple[int, ...]]:
-    """Facets as tuples of node numbers."""
+    """Return facets as tuples of node numbers."""
     return set(map(tuple, facets.tolist()))
 
 
 def check_increasing(name: str, line: Sequence[float] | np.ndarray) -> np.ndarray:
-    """(k ≥ 2,) coordinates in m that increase; else a ``ValueError`` with their name."""
+    """Return (k ≥ 2,) coordinates in m; ``ValueError`` with their name if they do not increase."""
     line = _check.array(name, line, (None,), units="m")
     if len(line) < 2 or (np.diff(line) <= 0).any():
         raise ValueError(f"{name} must hold at least two strictly increasing coordinates in m, "
@@ -221,7 +221,7 @@ def check_increasing(name: str, line: Sequence[float] | np.ndarray) -> np.ndarra
 
 
 def rectangle_mesh(x: Sequence[float] | np.ndarray, y: Sequence[float] | np.ndarray) -> Mesh:
-    """Structured triangles on the tensor grid of increasing coordinates ``x`` and ``y`` (m).
+    """Return structured triangles on the grid of increasing coordinates ``x`` and ``y`` (m).
 
     Nodes are numbered by cross-section (all ``y`` of the first ``x``, then of the second, ...), so
     that matrices on this mesh are banded with half-bandwidth ``len(y) + 1``. Diagonals alternate,
@@ -243,7 +243,7 @@ def rectangle_mesh(x: Sequence[float] | np.ndarray, y: Sequence[float] | np.ndar
 
 def graded(start: float, stop: float, cells: int, grading: float,
            ends: str = "both") -> np.ndarray:
-    """``cells + 1`` coordinates that crowd towards ``ends`` ("start", "stop" or "both").
+    """Return ``cells + 1`` coordinates, denser towards ``ends`` ("start", "stop" or "both").
 
     ``grading`` is the exponent of the clustering, ≥ 1; 1 is uniform.
     """

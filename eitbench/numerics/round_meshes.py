@@ -1,8 +1,7 @@
 """Meshes of round cross-sections, and prisms on any cross-section cut into tetrahedra.
 
-In the plane a section lies in (x, y). In space it still does, and the axis of the pipe, along which
-the fluid flows, is the third coordinate z; the plane channel of `eitbench.numerics.mesh` has its
-flow along x.
+A section is in the plane (x, y). The axis of a 3D pipe, along which the fluid flows, is the third
+coordinate z; the plane channel of `eitbench.numerics.mesh` has its flow along x.
 """
 
 from __future__ import annotations
@@ -55,7 +54,7 @@ def disc_mesh(radii: Sequence[float] | np.ndarray, angles: Sequence[np.ndarray])
     cells += [_between(inner, outer, first[k], first[k + 1])
               for k, (inner, outer) in enumerate(itertools.pairwise(rings))]
     triangles = np.concatenate(cells)
-    # All run counter-clockwise, so that no area is negative unless some lie on top of others.
+    # All are counter-clockwise, so that an area is negative only if some overlap.
     a, b, c = np.moveaxis(points[triangles], 1, 0)
     area = (b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0]
     if area.min() <= 0:
@@ -67,12 +66,12 @@ def disc_mesh(radii: Sequence[float] | np.ndarray, angles: Sequence[np.ndarray])
 
 def _between(inner: np.ndarray, outer: np.ndarray, first_inner: int,
              first_outer: int) -> np.ndarray:
-    """Counter-clockwise triangles (n_inner + n_outer, 3) between two rings of these angles."""
+    """Return triangles (n_inner + n_outer, 3), counter-clockwise, between rings of these angles."""
     i = np.arange(len(inner))
     j = np.arange(len(outer))
     middle_i, middle_j = (np.mod(0.5 * (ring + np.append(ring[1:], ring[0] + TWO_PI)), TWO_PI)
                           for ring in (inner, outer))
-    # All edges have one order around the turn; where two middles coincide the inner comes first.
+    # All edges are sorted by angle; where two midpoints coincide the inner edge comes first.
     on_outer = first_outer + _node_at(middle_j, middle_i, "left")
     on_inner = first_inner + _node_at(middle_i, middle_j, "right")
     inwards = np.stack([first_inner + i, on_outer, first_inner + (i + 1) % len(i)], axis=1)
@@ -81,14 +80,14 @@ def _between(inner: np.ndarray, outer: np.ndarray, first_inner: int,
 
 
 def _node_at(middles: np.ndarray, angle: np.ndarray, side: str) -> np.ndarray:
-    """The node after the last edge with its middle before ``angle`` ("left"), or not after it."""
+    """Return the node after the last edge with its midpoint < ``angle`` ("left") or ≤ ``angle``."""
     order = np.argsort(middles)
     before = order[np.searchsorted(middles[order], angle, side) - 1]  # type: ignore[call-overload]
     return (before + 1) % len(middles)
 
 
 def uniform_disc(radius: float, rings: int) -> Mesh:
-    """A disc of ``radius`` (m) in even triangles: 6k nodes on ring k, 1 + 3·rings·(rings + 1)."""
+    """Return a uniform disc of ``radius`` (m): 6k nodes on ring k, 1 + 3·rings·(rings+1) in all."""
     _check.number("radius", radius, low=0.0, open_low=True, units="m")
     _check.integer("rings", rings, low=1)
     number = np.arange(1, rings + 1)
@@ -97,12 +96,12 @@ def uniform_disc(radius: float, rings: int) -> Mesh:
 
 def electrode_disc(radius: float, spans: np.ndarray, cells_at_electrodes: int, rings: int,
                    grading: tuple[float, float] = (2.0, 1.5)) -> Mesh:
-    """EIT mesh of a disc, refined at the electrode edges and the wall.
+    """Return an EIT mesh of a disc, refined at the electrode edges and the wall.
 
-    Inwards the rings hold ever fewer nodes, about as far apart as the rings are, and stand ever
-    more evenly. ``ValueError`` naming the argument if it is out of range, of the wrong shape, or if
-    electrodes touch or overlap; also if the wall has cells so long that they cut through the rings
-    next to it.
+    Inner rings have fewer nodes, with a spacing similar to the distance of the rings and more
+    uniform than on outer rings. ``ValueError`` naming the argument if it is out of range, of the
+    wrong shape, or if electrodes touch or overlap; also if the wall has cells so long that they
+    intersect the rings next to it.
 
     Parameters
     ----------
@@ -143,14 +142,13 @@ def electrode_disc(radius: float, spans: np.ndarray, cells_at_electrodes: int, r
 
 
 def extrude(section: Mesh, z: Sequence[float] | np.ndarray) -> Mesh:
-    """Tetrahedra of the body with this section in (x, y) at all ``z`` (m, increasing).
+    """Return tetrahedra of the body with this section in (x, y) at all ``z`` (m, increasing).
 
     Nodes are numbered by cross-section: all of the first ``z`` as in the section, then of the
     second, and so on. Every triangle and two neighbouring ``z`` bound a prism of three tetrahedra.
     On a prism's side the diagonal leads up from the lower node number to the higher one, so that
-    neighbours agree about it; in every other layer it leads down, which makes the mesh its own
-    mirror image in z. ``ValueError`` if ``section`` is not a mesh in 2D, or ``z`` does not
-    increase.
+    neighbouring prisms share it; in every other layer it leads down, so that the mesh is symmetric
+    in z. ``ValueError`` if ``section`` is not a mesh in 2D, or ``z`` does not increase.
     """
     z = check_increasing("z", z)
     if section.dim != 2:
@@ -160,7 +158,7 @@ def extrude(section: Mesh, z: Sequence[float] | np.ndarray) -> Mesh:
     points = np.concatenate([sections, np.repeat(z, n)[:, None]], axis=1)
     a, b, c = np.sort(section.cells, axis=1).T
     layer = np.arange(len(z) - 1)[:, None]
-    # the end where diagonals begin
+    # the layer in which diagonals start
     start, stop = n * (layer + layer % 2), n * (layer + 1 - layer % 2)
     cells = [np.stack(np.broadcast_arrays(*corners), axis=-1).reshape(-1, 4) for corners in (
         (start + a, start + b, start + c, stop + c), (start + a, start + b, stop + b, stop + c),
@@ -171,7 +169,7 @@ def extrude(section: Mesh, z: Sequence[float] | np.ndarray) -> Mesh:
 def round_pipe_mesh(length: float, radius: float, spans_around: np.ndarray,
                     spans_along: np.ndarray, cells_at_electrodes: tuple[int, int], rings: int,
                     grading: tuple[float, float, float] = (2.0, 1.5, 2.0)) -> Mesh:
-    """EIT mesh of a round pipe 0 ≤ z ≤ length, electrodes at all pairs of spans around and along.
+    """Return an EIT mesh of a round pipe 0 ≤ z ≤ length, electrodes at all pairs of spans.
 
     ``ValueError`` naming the argument if it is out of range, of the wrong shape, or if electrodes
     touch or overlap.

@@ -1,1 +1,1 @@
-"""Floor 1: flow, transport (convection-diffusion), EIT (complete electrodes), observations."""
+"""Layer 1: flow, transport (convection-diffusion), EIT (complete electrodes), observations."""

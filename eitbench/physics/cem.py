@@ -27,10 +27,10 @@ from eitbench.physics.sensitivity import Sensitivity
 class CompleteElectrodeModel:
     """Electrode voltages, and their derivatives, for a nodal conductivity.
 
-    Voltages are linear in the currents, so for one conductivity everything is in one symmetric L×L
-    matrix, U = 𝓡 I with 𝓡1 = 0: one sparse factorisation serves every injection. ``ValueError`` if
-    the mesh falls apart, there are fewer than two electrodes, a facet is not on the boundary, two
-    electrodes share a facet, or a contact impedance is not positive.
+    Voltages are linear in the currents: one symmetric L×L matrix per conductivity determines them,
+    U = 𝓡 I with 𝓡1 = 0, and requires one sparse factorisation for all injections. ``ValueError``
+    if the mesh is not connected, there are fewer than two electrodes, a facet is not on the
+    boundary, two electrodes share a facet, or a contact impedance is not positive.
 
     Parameters
     ----------
@@ -63,7 +63,7 @@ class CompleteElectrodeModel:
                               places=basis.doflocs.T if mesh.dim == 3 else None)
         self._system = system
         self.n_unknowns = system.n
-        # K(σ) = constant + D σ, for the entries that the solver keeps, in its order
+        # K(σ) = constant + D σ, for the entries that the solver stores, in its order
         n = system.n + 1
         number = sp.csr_array((np.arange(len(rows)) + 1, (rows, columns)), shape=(n, n))
         padded = sp.vstack([sp.csr_array((1, mesh.n_nodes)), derivatives], format="csr")
@@ -112,22 +112,22 @@ class CompleteElectrodeModel:
 
     def linearise(self, conductivity: np.ndarray,
                   currents: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """`voltages` and `jacobian` together, from one factorisation."""
+        """Return `voltages` and `jacobian` from one factorisation."""
         currents = self._checked_currents(currents)
         resistance, table = self.transfer_resistance_derivatives(conductivity)
-        # (L, L·n_nodes): then one product gives every Jacobian in its final place
+        # (L, L·n_nodes), so that one product gives all Jacobians in their final memory order
         by_node = np.ascontiguousarray(table.reshape(len(table), -1).T)
         by_node = by_node.reshape(self.n_electrodes, -1)
         return currents @ resistance, (currents @ by_node).reshape(*currents.shape, -1)
 
     def transfer_resistance_derivatives(
             self, conductivity: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """𝓡 and its derivatives by nodal conductivity, from one factorisation for every injection.
+        """Return 𝓡 and its derivatives by nodal conductivity, from one factorisation.
 
         They are (L, L) in Ω (Ω·m in 2D) and (n_nodes, L, L) in Ω·m/S (Ω·m²/S in 2D), for
         ``conductivity`` (n_nodes,) in S/m, > 0.
-        The field of any injection is a combination of the L fields w_m of unit currents, taken out
-        evenly at all electrodes, so that ∂𝓡_ml/∂σ_j = −∫ φ_j ∇w_m·∇w_l.
+        The field of any injection is a combination of the L fields w_m of unit currents at m that
+        leave in equal shares at all electrodes, so that ∂𝓡_ml/∂σ_j = −∫ φ_j ∇w_m·∇w_l.
         """
         values = self._assemble(self._checked_conductivity(conductivity))
         columns = self._system.port_columns(values)
@@ -135,7 +135,7 @@ class CompleteElectrodeModel:
         return self._centred(grounded), self._sensitivity(fields @ self._centre.T)
 
     def contact_derivatives(self, conductivity: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """𝓡 (L, L) and its derivatives by each electrode's contact impedance, (L, L, L).
+        """Return 𝓡 (L, L) and its derivatives (L, L, L) by each electrode's contact impedance.
 
         Units are Ω and Ω/(Ω·m²) (2D: Ω·m, and per Ω·m²); l is the first index of the derivatives.
         Let w_m be the field and W_m the electrode potentials of a unit current at m that leaves in
@@ -170,7 +170,7 @@ class CompleteElectrodeModel:
         return sp.block_array([[mass, -load], [-load.T, total]], format="csr")
 
     def _assemble(self, conductivity: np.ndarray) -> np.ndarray:
-        """The solver's entries of K, (k,) or (k, b) for conductivity (n_nodes,) or (n_nodes, b)."""
+        """Return the entries of K for the solver, (k,) or (k, b) for (n_nodes,) or (n_nodes, b)."""
         values = self._derivatives @ conductivity
         return values + (self._constant if values.ndim == 1 else self._constant[:, None])
 
@@ -205,7 +205,7 @@ class CompleteElectrodeModel:
 
 
 class _Wall(NamedTuple):
-    """ScoreIntegrals over one electrode."""
+    """Integrals over one electrode."""
 
     mass: sp.csr_array
     """(N, N) ∫ u φ"""
@@ -230,7 +230,7 @@ def _conduction_form(s, u, v, _w):
 
 
 def _conduction(basis: skfem.CellBasis) -> tuple[np.ndarray, np.ndarray, sp.csr_array]:
-    """∫σ∇u·∇φ as entries: rows, columns, and their derivatives (entries, n_nodes) by nodal σ."""
+    """Return the entries of ∫σ∇u·∇φ: rows, columns, derivatives (entries, n_nodes) by nodal σ."""
     sigma = basis.with_element(element(basis.mesh.dim(), 1))
     tensor = _conduction_form.coo_data(sigma, basis, basis)
     i, j, k = (np.asarray(index, dtype=np.int64) for index in tensor.indices)

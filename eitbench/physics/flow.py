@@ -99,7 +99,7 @@ class RoundPipeFlow:
 
 
 def check_flow(mean_velocity: float, **size: float) -> None:
-    """``ValueError`` unless a mean velocity (m/s) is ≥ 0, and a size (m), if there is one, > 0."""
+    """Raise ``ValueError`` unless a mean velocity (m/s) is ≥ 0, and an optional size (m) > 0."""
     _check.number("mean_velocity", mean_velocity, low=0.0, units="m/s")
     for name, value in size.items():
         _check.number(name, value, low=0.0, open_low=True, units="m")

@@ -1,4 +1,4 @@
-"""`Mesh` under the name by which users import it; it is made in `eitbench.numerics.mesh`."""
+"""`Mesh` under the name by which users import it; it is defined in `eitbench.numerics.mesh`."""
 
 from eitbench.numerics.mesh import Mesh
 

@@ -19,21 +19,21 @@ from eitbench.numerics.fem import facet_numbers, integral, laplace
 from eitbench.numerics.mesh import Mesh, facet_set, validate_facets
 from eitbench.physics.transport import VelocityField
 
-_EDGES = np.array([[0, 1], [1, 2], [2, 0]])  # of a triangle; their middles are its nodes 3, 4, 5
+_EDGES = np.array([[0, 1], [1, 2], [2, 0]])  # of a triangle; their midpoints are its nodes 3, 4, 5
 _NEWTON_STEPS = 15
-_TOLERANCE = 1e-9  # of the last step, relative; what is left is about its square
+_TOLERANCE = 1e-9  # relative size of the last step; the remaining error is about its square
 
 
 @dataclass(frozen=True, eq=False)
 class SteadyFlow:
-    """A velocity field on a mesh, made by `steady_flow`: points (k, 2) in m -> (k, 2) in m/s.
+    """A velocity field on a mesh, from `steady_flow`: points (k, 2) in m -> (k, 2) in m/s.
 
-    Points outside the mesh take the velocity at the nearest point of the boundary.
+    At points outside the mesh it is the velocity at the nearest point of the boundary.
     """
 
     mesh: Mesh
     cell_velocity: np.ndarray
-    """(n_cells, 6, 2) velocity in m/s at each cell's nodes and middles of edges 01, 12 and 20."""
+    """(n_cells, 6, 2) velocity in m/s at each cell's nodes and midpoints of edges 01, 12 and 20."""
     pressure: np.ndarray
     """(n_nodes,) kinematic pressure (pressure over density) in m²/s²."""
 
@@ -45,7 +45,7 @@ class SteadyFlow:
 
 def steady_flow(mesh: Mesh, viscosity: float, walls: Sequence[tuple[np.ndarray, VelocityField]], *,
                 force: VelocityField | None = None) -> SteadyFlow:
-    """A steady flow by Newton's method from the Stokes flow, or else by continuation in viscosity.
+    """Compute a steady flow by Newton's method from the Stokes flow or a more viscous flow.
 
     The error is of third order in the cell size for the velocity and of second for the pressure (L2
     norms). Terms are not upwinded: a mesh too coarse for the Reynolds number leads to oscillations
@@ -100,13 +100,13 @@ class _Equations(NamedTuple):
     given: np.ndarray
     """(2n + n_nodes,) wall values, zero elsewhere."""
     free: np.ndarray
-    """Numbers of the unknowns that are not given."""
+    """Numbers of the unknowns that walls do not prescribe."""
     weights: np.ndarray
     """(n_nodes,) ∫ψᵢ."""
     closed: bool
     """True without outflow: the pressure is determined up to a constant, and one value is fixed."""
     cell_dofs: np.ndarray
-    """(n_cells, 6) numbers of the scalar unknowns at the nodes and edge middles of each cell."""
+    """(n_cells, 6) numbers of the scalar unknowns at the nodes and edge midpoints of each cell."""
 
 
 @skfem.BilinearForm
@@ -170,7 +170,7 @@ def _discretise(mesh: Mesh, walls: Sequence[tuple[np.ndarray, VelocityField]],
 def _wall_values(mesh: Mesh, basis: skfem.Basis,
                  walls: Sequence[tuple[np.ndarray, VelocityField]],
                  ) -> tuple[np.ndarray, np.ndarray, bool]:
-    """Velocity (n, 2) on the walls, the unknowns there, and whether the walls are all round."""
+    """Return the wall velocity (n, 2), its unknowns, and whether the walls are closed."""
     if not len(walls):
         raise ValueError("walls must hold at least one pair of facets and velocity")
     value = np.zeros((basis.N, 2))
@@ -200,7 +200,7 @@ def _sample(name: str, field: VelocityField, points: np.ndarray) -> np.ndarray:
 # -- solution --------------------------------------------------------------------------------------
 
 def _continuation(equations: _Equations, viscosity: float) -> np.ndarray:
-    """The solution x at this viscosity, if need be by way of higher ones."""
+    """Return the solution x at this viscosity, if necessary by continuation from higher ones."""
     at = viscosity
     ratio = 4.0
     found = _newton(equations, at)
@@ -227,7 +227,7 @@ def _continuation(equations: _Equations, viscosity: float) -> np.ndarray:
 
 def _newton(equations: _Equations, viscosity: float,
             start: np.ndarray | None = None) -> np.ndarray | None:
-    """x by Newton's method from ``start``, by default the Stokes flow; None if it diverges."""
+    """Return x by Newton's method from ``start`` (default: Stokes flow); None if it diverges."""
     x = _linear_solution(equations, viscosity, None) if start is None else start
     last = math.inf
     for k in range(_NEWTON_STEPS):
@@ -238,7 +238,7 @@ def _newton(equations: _Equations, viscosity: float,
         if x is not None:
             velocity, pressure = np.split(x, [len(equations.load)])
             step = np.abs(velocity - before[:len(velocity)]).max()
-            # √p is the speed that the pressure could make: v of a fluid at rest is mere rounding.
+            # √p is a velocity scale of the pressure: v of a fluid at rest is only rounding error.
             if step <= _TOLERANCE * max(np.abs(velocity).max(), math.sqrt(np.abs(pressure).max())):
                 return x
             if k > 1 and step > last:  # the second step may well be larger than the first
@@ -249,7 +249,7 @@ def _newton(equations: _Equations, viscosity: float,
 
 def _linear_solution(equations: _Equations, viscosity: float,
                      around: np.ndarray | None) -> np.ndarray | None:
-    """x of the equations linearised about ``around`` or rest (None); None if they are singular."""
+    """Solve for x, linearised about ``around`` or rest (None); return None if it is singular."""
     basis = equations.basis
     free = equations.free
     viscous = viscosity * equations.laplace

@@ -33,7 +33,7 @@ class Sensitivity:
         gradient = np.stack([phi[0].grad.transpose(1, 2, 0) for phi in at_corners.basis], axis=-1)
         gradient = gradient.reshape(basis.mesh.nelements, -1, gradient.shape[-1])
         weight = basis.dx.sum(axis=1) / ((dim + 1) * (dim + 2) * (dim + 3))
-        # (cells, vertices·dim, unknowns a cell), times √w
+        # (cells, vertices·dim, unknowns per cell), times √w
         self._gradient = np.sqrt(weight)[:, None, None] * gradient
 
     def __call__(self, fields: np.ndarray) -> np.ndarray:

@@ -190,11 +190,11 @@ class ConvectionDiffusion:
         return states[:, -1].copy(), derivatives
 
     def evolution_model(self) -> EvolutionModel:
-        """F, Y and H of (5.14–5.16) as dense matrices; computed once and kept."""
+        """Return F, Y and H of (5.14–5.16) as dense matrices; computed once and cached."""
         return self._evolution_model
 
     def transition(self) -> tuple[np.ndarray, np.ndarray]:
-        """F (n, n) and Y (n, n_inlet) of `evolution_model`, in half the time; computed once."""
+        """Return F (n, n) and Y (n, n_inlet) of `evolution_model` in half the time; cached."""
         return self._transition
 
     @cached_property
@@ -205,7 +205,7 @@ class ConvectionDiffusion:
         F = self._advance(identity, identity[self.inlet], np.zeros((m, n)))
         Y = self._advance(np.zeros((n, m)), np.zeros((m, m)), np.eye(m))
         for matrix in (F, Y):
-            matrix.setflags(write=False)                  # shared by all who use this model
+            matrix.setflags(write=False)                  # shared by all users of this model
         return F, Y
 
     @cached_property
@@ -219,7 +219,7 @@ class ConvectionDiffusion:
 
     def _advance(self, c: np.ndarray, before: np.ndarray, after: np.ndarray,
                  source: np.ndarray | None = None) -> np.ndarray:
-        """All sub-steps on (n, batch) columns, perhaps with a ``source`` added to c a second."""
+        """Compute all sub-steps of (n, batch) columns; ``source``: added to c per second."""
         load = None if source is None else self._mass @ source
         if c.shape[1] >= MIN_WIDE_COLUMNS:
             return self._advance_wide(c, before, after, load)
@@ -230,7 +230,7 @@ class ConvectionDiffusion:
 
     @cached_property
     def _kernel_arguments(self) -> tuple[Any, ...]:
-        """Matrices by rows, factors, nodes and rate, as `eitbench.numerics.kernels` wants them."""
+        """Matrices by rows, factors, nodes and rate: arguments of `eitbench.numerics.kernels`."""
         row_perm, column_perm, lower, upper, scale = self._solver.factors
         matrices = [(each.indptr, each.indices, each.data)
                     for each in (self._mass, self._explicit, self._implicit_inlet)]
@@ -240,11 +240,11 @@ class ConvectionDiffusion:
 
     def _advance_wide(self, c: np.ndarray, before: np.ndarray, after: np.ndarray,
                       load: np.ndarray | None = None) -> np.ndarray:
-        """All sub-steps on (n, batch) columns, perhaps with a ``load`` (n_free, batch).
+        """Compute all sub-steps of (n, batch) columns, with an optional ``load`` (n_free, batch).
 
-        A few columns at a time go through all of them, so that they stay in the processor's cache,
-        and a substitution takes all of them at once. Each becomes what `_substeps` makes of it, to
-        the bit.
+        A panel of columns goes through all sub-steps before the next one, so that it stays in the
+        CPU cache; each substitution processes the panel at once. The result is bit-identical to
+        `_substeps`.
         """
         kernels = compiled_kernels()
         width = kernels.WIDE
@@ -312,7 +312,7 @@ def inlet_nodes(mesh: Mesh, velocity: VelocityField) -> np.ndarray:
 
 
 def _velocity_at(velocity: VelocityField, x: np.ndarray, name: str = "velocity") -> np.ndarray:
-    """The field at quadrature points (d, cells, points), same shape back."""
+    """Return the field at quadrature points (d, cells, points), in the same shape."""
     points = x.reshape(len(x), -1).T
     value = _check.array(f"{name}(points)", velocity(points), points.shape, units="m/s")
     return value.T.reshape(x.shape)
@@ -328,7 +328,7 @@ def _supg_basis(mesh: Mesh) -> skfem.CellBasis:
 
 def _supg_matrices(mesh: Mesh, velocity: VelocityField,
                    diffusivity: float) -> tuple[sp.csr_array, sp.csr_array]:
-    """SUPG mass matrix and transport matrix (n, n): M ċ + K c = 0."""
+    """Return the SUPG mass matrix and transport matrix (n, n): M ċ + K c = 0."""
     basis = _supg_basis(mesh)
     v = _velocity_at(velocity, np.asarray(basis.global_coordinates()))
     tau, _ = _upwinding(basis, v, diffusivity)
@@ -349,7 +349,7 @@ def _supg_matrices(mesh: Mesh, velocity: VelocityField,
 def _supg_derivatives(mesh: Mesh, velocity: VelocityField, diffusivity: float,
                       directions: Sequence[VelocityField],
                       ) -> list[tuple[sp.csr_array, sp.csr_array]]:
-    """∂M/∂θ_k and ∂K/∂θ_k, each (n, n), at θ = 0 for the velocity v + Σ θ_k v_k."""
+    """Return ∂M/∂θ_k and ∂K/∂θ_k, each (n, n), at θ = 0 for the velocity v + Σ θ_k v_k."""
     basis = _supg_basis(mesh)
     x = np.asarray(basis.global_coordinates())
     v = _velocity_at(velocity, x)
@@ -367,10 +367,10 @@ def _supg_derivatives(mesh: Mesh, velocity: VelocityField, diffusivity: float,
     derivatives = []
     for number, direction in enumerate(directions):
         v_k = _velocity_at(direction, x, f"directions[{number}]")
-        test = tau * v_k + (by_velocity * v_k).sum(axis=0) * v  # what τ v changes by
+        test = tau * v_k + (by_velocity * v_k).sum(axis=0) * v  # derivative of τ v
         along = sum(np.abs((v_k * phi[0].grad).sum(axis=0)) for phi in basis.basis)
-        # In slow flow τ = |v|²/(3κ(Σᵢ|v·∇φᵢ|)²) depends on the direction only: from v = 0 τ v
-        # begins as τ(v_k) v_k.
+        # In slow flow τ = |v|²/(3κ(Σᵢ|v·∇φᵢ|)²) depends on the direction only: at v = 0 the
+        # derivative of τ v is τ(v_k) v_k.
         slow = (v_k**2).sum(axis=0) / np.maximum(3 * diffusivity * along**2, 1e-300)
         test = np.where(tau == 0.0, slow * v_k, test)
         by_mass = mass.assemble(basis, test=test)
@@ -381,7 +381,7 @@ def _supg_derivatives(mesh: Mesh, velocity: VelocityField, diffusivity: float,
 
 def _upwinding(basis: skfem.Basis, v: np.ndarray,
                diffusivity: float) -> tuple[np.ndarray, np.ndarray]:
-    """τ (cells, points), and its derivative by the velocity (d, cells, points), zero where τ is.
+    """Return τ (cells, points) and its derivative by v (d, cells, points), zero where τ is zero.
 
     τ = h/(2|v|)·(coth Pe − 1/Pe) with Pe = |v|h/(2κ) and h the cell's length along the flow (Brooks
     & Hughes 1982).

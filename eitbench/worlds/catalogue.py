@@ -353,8 +353,8 @@ register_injection(PIPE_2D_BUDGET, "eitbench/Pipe2DInjectionBudget-v0", test_see
                    is_starting_point=True, description="""
 The pipe of `eitbench/Pipe2D-v0` with rare slugs: strong slugs come one at a time, at random times,
 about three in an episode. The agent may inject in one step of six, so it has to detect a slug, then
-inject often, and save injections for the next one. When the budget is spent, every action is no
-injection (`action_masks`); injections within the budget cost nothing. In a step without injection
+inject often, and save injections for the next one. When the budget is used up, actions do not
+inject (`action_masks`); injections within the budget cost nothing. In a step without injection
 `voltages` are the amplifiers' noise (zero here) and `innovations` are zero. The first frame does
 not count against the budget.
 

@@ -78,7 +78,7 @@ class SinglePairPattern:
 
 @dataclass(frozen=True)
 class TankOppositeDiagonalPattern:
-    """Eight opposite pairs of a tank, then eight diagonal ones, far from the last ones [ours]."""
+    """Eight opposite, then eight diagonal pairs of a tank; successive ones are far apart [ours]."""
 
     def __call__(self, vessel: RoundTank) -> np.ndarray:
         half = vessel.n_electrodes // 2

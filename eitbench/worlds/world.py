@@ -131,7 +131,7 @@ class Flow(Protocol):
 
 
 class Target(Protocol):
-    """A concentration field that moves or rests: a frozen dataclass of SI numbers."""
+    """A moving or stationary concentration field: a frozen dataclass of SI numbers."""
 
     @property
     def background(self) -> float:
@@ -159,7 +159,7 @@ class Prior:
     """Prior of the estimators; standard deviations relative to ĉ_bh (thesis Table 5.1)."""
 
     expected_concentration: float = 25.0
-    """mol/m³; a rough level, deliberately not the background [ours]"""
+    """mol/m³; a rough concentration, deliberately not the background [ours]"""
     inflow_std: float = 1 / 4
     """of the inflow noise η [T]"""
     nodal_std: float = 1 / 50

@@ -10,7 +10,7 @@ from tiny_worlds import TINY
 
 @pytest.fixture
 def place(tmp_path, monkeypatch):
-    """The cache folder of a test, in a process that has read nothing yet."""
+    """Return the cache folder of a test, with empty caches in memory."""
     monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path / "cache"))
     forget()
     yield tmp_path / "cache"
@@ -19,5 +19,5 @@ def place(tmp_path, monkeypatch):
 
 @pytest.fixture(scope="session")
 def episode():
-    """Seed 7 of the tiny world, simulated without a cache."""
+    """Return seed 7 of the tiny world, simulated without a cache."""
     return simulate(TINY, 7, cache=False)

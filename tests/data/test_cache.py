@@ -30,24 +30,24 @@ pytestmark = pytest.mark.usefixtures("place")
 
 
 def bits(arrays):
-    """Types, shapes, bytes and order in memory of arrays."""
+    """Return types, shapes, bytes and memory order of arrays."""
     return {name: (array.dtype, array.shape, array.tobytes(), array.flags.f_contiguous)
             for name, array in arrays.items()}
 
 
 def files(place):
-    """Every file below a folder, hidden ones too."""
+    """Return all files below a folder, including hidden ones."""
     return sorted(each for each in Path(place).rglob("*") if each.is_file())
 
 
 def counting():
-    """A function that builds the arrays, and the list of its calls."""
+    """Return a function that builds the arrays, and the list of its calls."""
     calls = []
     return (lambda: calls.append(1) or ARRAYS), calls
 
 
 def assert_built_again(place):
-    """The file is rejected, built once, and good for the next call."""
+    """The file is rejected, rebuilt once, and valid for the next call."""
     forget()
     assert not is_cached(KEY)
     build, calls = counting()
@@ -57,7 +57,7 @@ def assert_built_again(place):
 
 
 def test_arrays_come_back_mapped_and_read_only(place):
-    """Built once, and the same to the bit whether built or read."""
+    """Arrays are built once, and bit-identical if built or loaded."""
     build, calls = counting()
     for _ in range(3):
         found = cached(KEY, build)
@@ -102,7 +102,7 @@ def test_file_of_another_key_is_built_again(other, place):
 
 
 def test_concurrent_writers(place):
-    """Eight threads, one file: each sees all of it, and one file stays."""
+    """Eight threads with one key all get complete arrays, and one file remains."""
     together = threading.Barrier(8)
 
     def use(_):
@@ -134,7 +134,7 @@ def test_unwritable_cache_warns_and_still_returns_the_arrays(how, place, monkeyp
 
 @pytest.mark.parametrize("error", [OSError, KeyboardInterrupt])
 def test_failed_write_leaves_no_trace(error, tmp_path, monkeypatch):
-    """The old file is unchanged, and there is no other file."""
+    """The old file is unchanged, without other files."""
     path = tmp_path / "folder" / "file"
     write_atomically(path, b"old")
 
@@ -163,7 +163,7 @@ def test_shipped_arrays_come_first_and_damaged_ones_are_ignored(tmp_path, monkey
 
 
 def test_cache_folder(monkeypatch, tmp_path):
-    """$EITBENCH_CACHE before $XDG_CACHE_HOME before ~/.cache."""
+    """$EITBENCH_CACHE has priority over $XDG_CACHE_HOME, and that over ~/.cache."""
     monkeypatch.setenv(CACHE_VARIABLE, "")
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "xdg"))
     assert cache_folder() == tmp_path / "xdg" / "eitbench"
@@ -173,7 +173,7 @@ def test_cache_folder(monkeypatch, tmp_path):
 
 
 def test_worlds_of_other_numbers_have_other_folders():
-    """Each part's numbers count, and the name, with which the folder begins."""
+    """A key depends on parameters of each component, and on the name, with which the folder begins."""
     others = [TINY, *(TINY.with_changes(change) for change in (
         {"vessel": {"contact_impedance": 1e-3}}, {"flow": {"diffusivity": 1e-3}},
         {"target": {"arrivals": {"interval": 0.021}}}, {"schedule": {"pattern": {"frame": 3}}},
@@ -184,7 +184,7 @@ def test_worlds_of_other_numbers_have_other_folders():
 
 
 def test_worlds_that_differ_in_what_is_read_share_their_episodes():
-    """Noise and faults of the instrument, a budget and the prior do not move the fluid."""
+    """Keys do not depend on instrument noise and faults, budget and prior."""
     for change in ({"instrument": {"noise_relative": 0.05, "n_dead_range": [1, 1]}},
                    {"prior": {"inflow_std": 0.5}}, {"schedule": {"budget": 2}}):
         other = TINY.with_changes(change)

@@ -1,4 +1,4 @@
-"""Examples to learn from: what they hold is what environments show and score, and files hold the same."""
+"""Training examples: they equal observations and scores of environments, also in exported files."""
 
 import pickle
 import re
@@ -24,7 +24,7 @@ REGION = "eitbench/Pipe2DInjectionFlow-v0"
 
 @pytest.fixture(scope="module")
 def tiny():
-    """Two episodes of five steps."""
+    """Return a data set of two episodes of five steps."""
     return eitbench.dataset(PIPE, "train:0-1", world=CHANGES)
 
 
@@ -90,7 +90,7 @@ def test_scores_are_the_same_in_few_coordinates(env, changes):
 
 @pytest.mark.parametrize("env, changes", [(PIPE, CHANGES), (REGION, WANDERING)])
 def test_modes_are_the_best_basis(env, changes):
-    """Orthonormal over what is scored; they leave what the singular values that they leave say, and all of them
+    """Modes are orthonormal over the scored region; the residual equals the omitted singular values, and all of them
     nothing."""
     examples = eitbench.dataset(env, "train:0-1", world=changes)
     states = np.concatenate([each.truth[examples.warm_up::2] for each in examples]) - examples.world.background
@@ -106,33 +106,33 @@ def test_modes_are_the_best_basis(env, changes):
         examples.pod_modes(len(states) + 1)
 
 
-@pytest.mark.parametrize("basis, mean, said", [
+@pytest.mark.parametrize("basis, mean, message", [
     (np.ones((3, 2)), None, "basis"), (np.ones((1, 2)), None, "some of these 2 depend"),
     (np.full((1, 1), np.nan), None, "basis"), (None, np.zeros(3), "mean"), (None, "much", "mean must be a number")])
-def test_bases_that_are_none_are_explained(tiny, basis, mean, said):
+def test_invalid_bases_are_explained(tiny, basis, mean, message):
     n = tiny.mesh.n_nodes
     basis = np.ones((n, 1)) if basis is None else np.repeat(basis, n, axis=0) if len(basis) == 1 else basis
-    with pytest.raises(ValueError, match=said):
+    with pytest.raises(ValueError, match=message):
         tiny.project(basis, mean)
 
 
-def test_the_flow_is_told_where_it_is_asked_for():
-    """A parabola is the profile itself, so that its mean velocity is found."""
+def test_examples_contain_a_requested_flow():
+    """A parabola is in the span of the profiles, so that the fit is exact."""
     examples = eitbench.dataset("eitbench/Pipe2DUnknownVelocity-v0", "train:0", world=FAST)
     profiles = examples.world.velocity_model.profiles
     there = simulate(examples.world, 0).velocity
     np.testing.assert_allclose(examples[0].velocity @ profiles.T, there, rtol=1e-9)
 
 
-@pytest.mark.parametrize("env, seeds, said", [
+@pytest.mark.parametrize("env, seeds, message", [
     ("eitbench/Nowhere-v0", "train:0", "env must be one of"),
     (PIPE, [], "at least one episode, got \\[\\]"),
     (PIPE, [1.5], "seeds must be an integer"),
     (PIPE, [3, 200_003], "must name the split .* 'test:3', got 200003"),
     (PIPE, "200003", "must name the split of test episodes"),
 ])
-def test_mistakes(env, seeds, said):
-    with pytest.raises(ValueError, match=said):
+def test_mistakes(env, seeds, message):
+    with pytest.raises(ValueError, match=message):
         eitbench.dataset(env, seeds)
 
 
@@ -142,7 +142,7 @@ def test_an_estimate_of_another_shape_is_refused(tiny):
 
 
 def test_iterating_simulates_few_at_a_time(monkeypatch, tmp_path):
-    """Eight together, and those only that come next: memory is bounded."""
+    """Iteration simulates the next eight episodes only: memory is bounded."""
     monkeypatch.setenv("EITBENCH_CACHE", str(tmp_path))
     asked = []
     simulated = presimulation.simulate_batch
@@ -158,7 +158,7 @@ def test_iterating_simulates_few_at_a_time(monkeypatch, tmp_path):
 
 
 def test_torch_loads_batches(tiny):
-    """Through a pickle, as processes of a loader get it."""
+    """A pickled data set works, as in processes of a data loader."""
     batch = next(iter(torch.utils.data.DataLoader(pickle.loads(pickle.dumps(tiny.torch())), batch_size=2)))
     assert batch["seed"].tolist() == [0, 1] and batch["truth"].dtype == torch.float32
     for name in ("voltages", "currents", "truth", "square"):
@@ -173,7 +173,7 @@ def test_without_torch_it_says_what_to_install(tiny, monkeypatch):
 
 
 def read(path):
-    """The fields of a file."""
+    """Return the fields of a file."""
     if path.suffix == ".npz":
         with np.load(path) as file:
             return dict(file)
@@ -201,7 +201,7 @@ def test_files_hold_the_same_and_more_can_be_added(tiny, tmp_path, format, suffi
 
 
 def test_the_score_on_the_card_is_ours(tiny, tmp_path, monkeypatch):
-    """The lines of the README run in the folder of its files."""
+    """The code of the README runs in the folder of its files."""
     export(tiny, tmp_path)
     monkeypatch.chdir(tmp_path)
     (lines,) = re.findall(r"```python\n(.*?)```", (tmp_path / "README.md").read_text(), re.DOTALL)

@@ -31,7 +31,7 @@ pytestmark = pytest.mark.usefixtures("place")
 
 
 def values_at(points, mesh):
-    """Dense matrix from nodal values on ``mesh`` to values at ``points``: every point is looked for in every cell."""
+    """Return the dense matrix from nodal values on ``mesh`` to ``points``, with a search of all cells."""
     matrix, found = np.zeros((len(points), mesh.n_nodes)), np.zeros(len(points), dtype=bool)
     homogeneous = np.column_stack([points, np.ones(len(points))])
     for cell in mesh.cells:
@@ -54,15 +54,15 @@ def integral_of_square(mesh, nodal):
 
 @pytest.fixture(scope="module")
 def to_truth():
-    """Interpolation from the model's nodes to the truth's, dense."""
+    """Return the dense interpolation from the model's nodes to the truth's."""
     return values_at(cached_truth_model(TINY).transport.mesh.points, TINY.estimator_model().transport.mesh)
 
 
 @pytest.mark.parametrize("kind", ["near the truth", "good", "bad", "constant", "background"])
 def test_score_is_the_integral_over_the_truth(kind, episode, to_truth):
-    """The step error from moments equals ∫(ĉ − c)²/∫c² taken over the truth's own triangles, whatever the estimate.
+    """The step error from moments equals ∫(ĉ − c)²/∫c² over the truth's triangles for any estimate.
 
-    To 1e-6 of it, but for 3e-10 that single precision of the moments costs (measured: 6e-11).
+    The relative tolerance is 1e-6, plus 3e-10 for the single precision of the moments (measured: 6e-11).
     """
     exactly = {"rtol": 1e-6, "atol": 3e-10}
     mesh, nodes = cached_truth_model(TINY).transport.mesh, TINY.estimator_model().transport.mesh.points
@@ -75,11 +75,11 @@ def test_score_is_the_integral_over_the_truth(kind, episode, to_truth):
                 "background": np.full((5, len(nodes)), TINY.background)}[kind]
     exact = integral_of_square(mesh, estimate @ to_truth.T - truth) / integral_of_square(mesh, truth)
     if kind == "near the truth":
-        assert exact.max() < 1e-4                   # what the coarser mesh cannot hold, and no more
+        assert exact.max() < 1e-4                   # the projection error on the coarser mesh
     entries, mass = cached_episode(TINY, 7), scoring_constants(TINY).mass
     scored = step_error(mass, estimate - TINY.background, entries["moment"], entries["deviation"], entries["square"])
     np.testing.assert_allclose(scored, exact, **exactly)
-    for t in range(5):                                 # one step at a time, as the environment asks
+    for t in range(5):                                 # one step at a time, as in environments
         one = step_error(mass, estimate[t] - TINY.background, entries["moment"][t],
                          entries["deviation"][t], entries["square"][t])
         np.testing.assert_allclose(one, exact[t], **exactly)
@@ -101,7 +101,7 @@ def test_outline_knows_the_largest_voltage():
 
 
 def test_resistances_and_noise_are_those_of_the_episode(episode):
-    """Nothing is rounded of what makes the voltages."""
+    """Transfer resistances and noise are stored without rounding."""
     entries = cached_episode(TINY, 7)
     assert entries.shape == (5,) and entries["moment"].shape == (5, 1701)
     for name in ("transfer_resistance", "noise"):
@@ -134,7 +134,7 @@ def test_cycle_voltages_have_the_faults_of_the_episode():
 
 
 def test_playing_what_is_stored_needs_no_finite_elements(episode):
-    """With cached episode and scoring constants, making, resetting and stepping an environment builds no mesh."""
+    """Environments build no mesh if the episode and the scoring constants are cached."""
     cached_episode(TINY, 7), scoring_constants(TINY)
     program = (f"import sys, gymnasium as gym, numpy as np, eitbench\n"
                f"env = gym.make('eitbench/Pipe2D-v0', world={CHANGES!r})\n"
@@ -160,7 +160,7 @@ def test_first_steps_have_the_bits_of_the_whole(id):
     begun = cached_episode_prefix(world, 3, 1)
     assert len(begun) == 1 + EXTRA_STEPS and not is_episode_cached(world, 3)
     states = [concentration_at(world, 3, t, 1) for t in (0, 1 + EXTRA_STEPS)]
-    assert not list(cache.folder(world).glob("3.*"))                       # nothing is left behind
+    assert not list(cache.folder(world).glob("3.*"))                       # without temporary files
     whole = cached_episode(world, 3)
     assert begun.tobytes() == whole[:1 + EXTRA_STEPS].tobytes()
     truth = simulate(world, 3).concentration
@@ -173,7 +173,7 @@ def test_first_steps_have_the_bits_of_the_whole(id):
     ("eitbench/Pipe2DFixedLag-v0", {"lag": 2}), ("eitbench/Pipe2DInjectionFlow-v0", {"estimator": "none"}),
     ("eitbench/RotatingTankInjection-v0", {})])
 def test_playing_is_the_same_whether_it_was_recorded_before(id, kwargs):
-    """Observations and rewards, to the bit; nothing is recorded before a step needs it."""
+    """Observations and rewards are bit-identical; an episode is not cached before a step needs it."""
     world = entry(id).world.with_changes(longer(id))
 
     def played():

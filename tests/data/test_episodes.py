@@ -27,7 +27,7 @@ def bits(arrays):
 
 
 def test_same_bits_in_this_process_from_the_cache_and_side_by_side(episode, monkeypatch):
-    """Only the seed is random, and numpy's global state is neither used nor changed. A simulation up to an
+    """Episodes depend on the seed only; numpy's global state is neither used nor changed. A simulation up to an
     earlier step has the same bits."""
     np.random.seed(1)  # noqa: NPY002 (the global state is what this is about)
     before = np.random.get_state()[1].copy()  # noqa: NPY002
@@ -60,7 +60,7 @@ def test_other_processes_same_bits_and_share_one_file(episode, place):
 
 
 def test_no_cache_neither_reads_nor_writes(episode, place):
-    """`cache=False` leaves the folder alone and simulates even if a file is there."""
+    """`cache=False` does not change the folder and simulates even if a file exists."""
     simulate(TINY, 7, cache=False)
     assert not place.exists()
     store(episode_key(TINY, "7.truth"), episode._replace(noise=episode.noise + 1.0)._asdict())
@@ -93,7 +93,7 @@ def test_resistances_belong_to_the_concentrations(episode):
     observation = cached_truth_model(TINY).observation
     for t in (1, 5):
         expected = observation.transfer_resistance(episode.concentration[t].astype(float))
-        # Concentrations are kept in single precision, resistances as computed.
+        # Concentrations are stored in single precision, resistances as computed.
         np.testing.assert_allclose(episode.transfer_resistance[t - 1], expected, atol=1e-6 * np.abs(expected).max())
 
 
@@ -106,11 +106,11 @@ def test_voltages_follow_the_noise_formula(episode):
 
 
 def test_noise_is_standard_normal(monkeypatch):
-    """48,000 draws of one long episode: N(0, 1), and independent from one reading or step to the next."""
+    """48,000 draws of one long episode are N(0, 1), and independent between measurements and steps."""
     electrodes = SimpleNamespace(cem=SimpleNamespace(n_electrodes=16), transfer_resistance=lambda c: np.eye(16))
     still = SimpleNamespace(mesh=SimpleNamespace(points=np.zeros((1, 2)), n_nodes=1),
                             inlet=np.array([0]),
-                            # the flow takes no part in this
+                            # independent of the flow
                             time_step=2.5e-3, step=lambda c, *_: c)
     monkeypatch.setattr(episodes, "cached_truth_model", lambda _: Discretisation(still, electrodes))
     long = PIPE_2D.with_changes({"schedule": {"scored_steps": 2982}})
@@ -124,7 +124,7 @@ def test_noise_is_standard_normal(monkeypatch):
 
 
 def test_inflow_has_slugs_of_both_signs_from_beginning_to_end():
-    """Every episode sees concentration rise and fall by a tenth and more; on average it does neither, at any time."""
+    """Concentration rises and falls by at least a tenth in every episode; its mean is constant in time."""
     points = np.stack([np.zeros(21), np.linspace(-0.05, 0.05, 21)], axis=1)
     times = np.linspace(-0.09, PIPE_2D.n_steps * 5e-3, 400)
     drawn = [PIPE_2D.target.draw_inflow(PIPE_2D, np.random.default_rng(seed)) for seed in range(20)]

@@ -1,4 +1,4 @@
-"""Shipped files: they are what would be built now, and spare the first reset a simulation."""
+"""Shipped files equal newly built ones, and make the first reset possible without a simulation."""
 
 import gymnasium as gym
 import numpy as np
@@ -31,7 +31,7 @@ def test_shipped_is_what_would_be_built(file):
 
 
 def test_models_are_compared_in_one_basis():
-    """Turned by a rotation it is the same model; with another number it is not."""
+    """A rotated basis is the same model; with another number it differs."""
     shipped = next(load_shipped(file.key) for file in EXPECTED if file.key.name.startswith("reduced"))
     full = unpack_model(shipped)
     turn, _ = np.linalg.qr(np.random.default_rng(0).normal(size=(120, 120)))
@@ -57,7 +57,7 @@ def test_models_are_compared_in_one_basis():
      [{"instrument": {"noise_relative": 0.1}}, {"prior": {"nodal_std": 0.1}}, {"flow": {"mean_velocity": 4.0}},
       {"schedule": {"time_step": 4e-3}}, {"vessel": {"electrodes_per_wall": 4}}])])
 def test_a_file_belongs_to_its_numbers(key, same, other):
-    """Numbers on which it does not depend may differ; no others."""
+    """Files are loaded for any value of parameters on which they do not depend, and not for others."""
     world = entry("eitbench/Pipe2DInjectionFlow-v0").world
     assert all(key(world.with_changes(change)) == key(world) for change in same)
     assert all(key(world.with_changes(change)) != key(world) for change in other)

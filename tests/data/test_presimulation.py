@@ -1,5 +1,5 @@
-"""The bank: exactly what is missing is made, with the bits of a recording made alone, and nothing done is lost. The
-pool: unseeded resets draw few episodes at first, the same whatever has been simulated before."""
+"""Presimulation: missing episodes are simulated, bit-identical to single ones, and finished ones are kept. The
+sampler: unseeded resets draw few episodes at first, independent of the cache."""
 
 import re
 import shutil
@@ -28,7 +28,7 @@ SEEDS = range(10)
 
 @pytest.fixture(autouse=True)
 def place(tmp_path, monkeypatch):
-    """The ids of the plain pipe have the tiny world, and the cache is a folder of this test."""
+    """Give ids of the plain pipe the tiny world, and the test a cache folder."""
     monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path / "cache"))
     shorten(monkeypatch, dict.fromkeys(PLAIN, CHANGES))
     forget()
@@ -38,13 +38,13 @@ def place(tmp_path, monkeypatch):
 
 @pytest.fixture(scope="module")
 def alone():
-    """The bytes of each recording when its episode is simulated by itself."""
+    """Return the bytes of each cached episode, simulated alone."""
     return {seed: build_cached_episode(TINY, simulate(TINY, seed, cache=False)).tobytes() for seed in SEEDS}
 
 
 @pytest.fixture
 def asked(monkeypatch):
-    """The seeds of each batch that is simulated in this process."""
+    """Return the seeds of each batch that this process simulates."""
     batches = []
 
     def counting(world, seeds, *more, **options):
@@ -56,7 +56,7 @@ def asked(monkeypatch):
 
 
 def names(place):
-    """The files of a folder."""
+    """Return the files of a folder."""
     return sorted(path.name for path in place.iterdir())
 
 
@@ -67,11 +67,11 @@ def stamps(place):
 
 @pytest.mark.parametrize("n_jobs", [1, 2])
 def test_recordings_have_the_bits_of_those_made_alone(n_jobs, place, alone, monkeypatch):
-    """In a batch of eight or in processes, each cached episode belongs to its seed, and no truth is stored."""
-    get_reusable_executor().shutdown(wait=True)      # workers keep the cache folder they began with
+    """Each cached episode belongs to its seed, in a batch of eight or in processes, and truths are not stored."""
+    get_reusable_executor().shutdown(wait=True)      # workers keep their initial cache folder
     assert presimulate(TINY, SEEDS, n_jobs=n_jobs) == 10
     assert names(place) == sorted(f"{seed}.npy" for seed in SEEDS)
-    monkeypatch.setattr("eitbench.data.episode_cache.simulate", None)               # all are there
+    monkeypatch.setattr("eitbench.data.episode_cache.simulate", None)               # all are cached
     assert {seed: cached_episode(TINY, seed).tobytes() for seed in SEEDS} == alone
 
 
@@ -92,7 +92,7 @@ def test_only_what_is_missing_is_made(place, asked, alone):
 
 
 def test_interrupted_fill_keeps_what_is_done_and_resumes(place, asked, alone, monkeypatch):
-    """Ctrl-C after the third recording: three are there and sound, and the next call makes the other seven."""
+    """After Ctrl-C at the third episode, three are cached and valid, and the next call simulates the other seven."""
     real = cache.store
 
     def interrupted(key, arrays):
@@ -114,7 +114,7 @@ def test_interrupted_fill_keeps_what_is_done_and_resumes(place, asked, alone, mo
 
 
 def test_predicted_size_is_that_of_the_files(place):
-    """Within 1 %, with the integrals over a region where there is one."""
+    """The estimated size is accurate to 1 %, with integrals over a region."""
     region = PIPE_2D_DRIFTING.with_changes(FAST)
     for each in (TINY, region):
         presimulate(each, [0])
@@ -132,7 +132,7 @@ def test_fill_names_what_is_wrong(seed):
 
 
 def test_workers_write_where_the_parent_looks(monkeypatch, tmp_path):
-    """$EITBENCH_CACHE changes between two fills; workers that live on do not keep the old one."""
+    """If $EITBENCH_CACHE changes between two calls, existing workers use the new folder."""
     for name in ("one", "two"):
         monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path / name))
         forget()
@@ -153,8 +153,8 @@ def test_command_fills_and_resumes(place, asked, alone):
 
 
 def test_full_disk_is_refused_before_anything_is_simulated(place, asked, monkeypatch):
-    """One byte too few: exit code 2 and how much is needed; with just enough it goes ahead, and what
-    is there already needs no room."""
+    """One byte too few leads to exit code 2 and the required size; with enough it runs, and cached episodes
+    need no space."""
     free = [2 * cached_episode_bytes(TINY) - 1]
     monkeypatch.setattr(shutil, "disk_usage", lambda _: SimpleNamespace(free=free[0]))
     code, said, complaint = command("bank", "--seeds", "train:0-1", "-j", "1")
@@ -173,14 +173,14 @@ def test_full_disk_is_refused_before_anything_is_simulated(place, asked, monkeyp
     (["-j", "0"], "--jobs"),
 ])
 def test_mistakes_are_explained(arguments, message, place, asked):
-    """Exit code 2 and a sentence that names the argument; no traceback, and nothing is simulated."""
+    """An invalid argument leads to exit code 2 and a sentence with its name, without a traceback or simulation."""
     code, said, complaint = command("bank", *arguments)
     assert code == 2 and said == "" and message in complaint and "Traceback" not in complaint
     assert asked == [] and not place.exists()
 
 
 def test_pool_grows_with_the_resets():
-    """1, 8, 16, … up to a thousand; a plain PPO of 20,000 steps meets eight episodes."""
+    """The sampler has 1, 8, 16, … up to 1000 episodes; PPO with 20,000 steps draws from eight."""
     random, drawn, found = np.random.default_rng(0), EpisodeSampler(None), []
     for _ in range(9000):
         found.append(drawn.size)
@@ -196,7 +196,7 @@ def test_pool_grows_with_the_resets():
 @pytest.mark.parametrize(("id", "kwargs"), [
     ("eitbench/Pipe2D-v0", {}), ("eitbench/Pipe2DInjection-v0", {"estimator": "none"})])
 def test_the_sequence_depends_on_the_seed_alone(id, kwargs):
-    """Not on what lies in the cache."""
+    """Draws do not depend on the cache."""
     changes = world(id)["world"]
 
     def seen():

@@ -34,7 +34,7 @@ def test_names_are_made_of_what_was_parsed(split, number):
 
 @given(st.sampled_from(list(SPLITS)), st.lists(st.tuples(numbers, st.integers(0, 20)), min_size=1, max_size=5))
 def test_parts_add_up_without_repeats(split, parts):
-    """A list of ranges holds each of its numbers once, in the order of first mention."""
+    """A list of ranges has each number once, in the order of first mention."""
     spans = [(first, min(first + more, 99_999)) for first, more in parts]
     text = f"{split}:" + ",".join(f"{first}-{last}" if last > first else f"{first}" for first, last in spans)
     expected = [SPLITS[split].start + i for first, last in spans for i in range(first, last + 1)]
@@ -48,7 +48,7 @@ def test_parts_add_up_without_repeats(split, parts):
     ("test:4-1", "must increase"), ("dev:99999-100000", "stay below 100000"), (str(2**31), "stay below 2147483648"),
 ])
 def test_errors_say_what_was_expected(text, message):
-    """Other forms, unknown splits and numbers beyond a split are refused, quoting the text."""
+    """Other forms, unknown splits and numbers beyond a split are rejected with the text."""
     with pytest.raises(ValueError, match=message) as caught:
         parse_seeds(text)
     assert repr(text) in str(caught.value)

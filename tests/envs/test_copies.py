@@ -1,4 +1,4 @@
-"""A copy made in mid-episode goes on exactly as the original would, and leaves it alone: for planning and saving."""
+"""A copy made during an episode continues like the original and is independent of it: for planning and saving."""
 
 import copy
 import pickle
@@ -25,13 +25,13 @@ copied = pytest.mark.parametrize("how", COPIES)
 
 
 def changes(name: str, given: dict) -> dict:
-    """Arguments for short episodes; where a reduced filter is built, of the world for which other tests build it."""
+    """Return arguments for short episodes; with a reduced filter, the world for which other tests build it."""
     is_reduced = "Injection" in name and "estimator" not in given
     return ({"world": injection_envs.world(name), "episodes": 2} if is_reduced else short(name)) | given
 
 
 def begun(name: str, given: dict, seed: int | None = 3):
-    """An environment after a reset and one step, and actions for steps to come."""
+    """Return an environment after a reset and one step, and actions for further steps."""
     env = gym.make(name, **changes(name, given))
     env.reset(seed=seed)
     env.action_space.seed(0)
@@ -41,7 +41,7 @@ def begun(name: str, given: dict, seed: int | None = 3):
 
 
 def to_the_end(env, actions):
-    """All that is seen and paid until the episode ends, and at the beginning of the next one."""
+    """Return all step results until the episode ends, and at the beginning of the next episode."""
     seen = []
     for action in actions:
         seen.append(env.step(action))
@@ -51,7 +51,7 @@ def to_the_end(env, actions):
 
 
 def assert_equal(these, those):
-    """Equal up to rounding: the arrays of a copy may be aligned differently, and BLAS then sums in another order."""
+    """Compare up to rounding: arrays of a copy may be aligned differently, which changes BLAS's summation order."""
     assert len(these) == len(those)
     for a, b in zip(these, those, strict=True):
         if isinstance(a, dict):
@@ -67,7 +67,7 @@ def assert_equal(these, those):
 
 @pytest.mark.parametrize(("name", "given"), KINDS)
 def test_a_copy_goes_on_as_the_original_would(name, given):
-    """To the end, and in the episode that is drawn after it; however it was copied, and whichever is played first."""
+    """Step results are equal to the end and in the next episode, for each kind of copy and any order of the two."""
     env, actions = begun(name, given)
     others = [how(env) for how in COPIES.values()]
     first = to_the_end(others[0], actions)
@@ -82,7 +82,7 @@ def test_a_copy_goes_on_as_the_original_would(name, given):
 @pytest.mark.parametrize(("name", "given"), [(PIPE, {}), (INJECTION, {}), (INJECTION, {"threads": 2}), (FLOW, {}),
                                              (INFLOW, {"threads": 2})])
 def test_many_at_once(name, given, how):
-    """Vector environments too, with or without threads, also beyond the episode's end."""
+    """Copies of vector environments are equal too, with or without threads, also beyond the episode's end."""
     envs = gym.make_vec(name, num_envs=3, vectorization_mode="vector_entry_point", **changes(name, given))
     envs.reset(seed=1)
     envs.action_space.seed(0)
@@ -96,21 +96,21 @@ def test_many_at_once(name, given, how):
 
 @pytest.mark.parametrize("name", [PIPE, INJECTION])
 def test_in_another_process(name, tmp_path):
-    """What is pickled here goes on there."""
+    """A pickled environment continues in another process."""
     env, actions = begun(name, {})
     (tmp_path / "env").write_bytes(pickle.dumps((env, actions)))
     code = (f"import pathlib, pickle, sys\nimport eitbench\nhere = pathlib.Path({str(tmp_path)!r})\n"
             "env, actions = pickle.loads((here / 'env').read_bytes())\n"
-            "(here / 'played').write_bytes(pickle.dumps([env.step(action) for action in actions[:3]]))\n")
+            "(here / 'steps').write_bytes(pickle.dumps([env.step(action) for action in actions[:3]]))\n")
     subprocess.run([sys.executable, "-c", code], check=True)
-    there = pickle.loads((tmp_path / "played").read_bytes())
+    there = pickle.loads((tmp_path / "steps").read_bytes())
     for a, b in zip(there, [env.step(action) for action in actions[:3]], strict=True):
         np.testing.assert_allclose(a[1], b[1], rtol=1e-9)
         assert a[2:] == b[2:]
 
 
 def test_a_copy_is_small():
-    """Models are not copied: in a pipe of the thesis' size a copy is of an episode, not of its meshes."""
+    """Models are not copied: in a pipe of the thesis' size a copy contains the episode without meshes."""
     env = gym.make(PIPE)
     env.reset(seed=0)
     assert env.unwrapped.task.mesh.n_nodes > 1000

@@ -11,23 +11,23 @@ from eitbench.worlds import entries
 
 @pytest.fixture(scope="module", params=list(entries()))
 def described(request):
-    """Every id with its page and its environment."""
+    """Return an id with its page and its environment."""
     return request.param, describe_environment(request.param), gym.make(request.param).unwrapped
 
 
 def section(text: str, heading: str) -> str:
-    """The part of a page below a heading."""
+    """Return the section of a page below a heading."""
     return text.split(f"## {heading}\n\n")[1].split("\n\n## ")[0]
 
 
 def table(text: str, column: int = 1) -> dict[str, str]:
-    """First column -> another one, of the rows of a page's tables."""
+    """Map the first column of a page's tables to another column."""
     rows = re.findall(r"^\| `?([\w .'’]+?)`? \| (.*?) \|(?: (.*) \|)?$", text, re.MULTILINE)
     return {row[0]: row[column].strip("`") for row in rows}
 
 
 def test_sections_and_sizes(described):
-    """The world's own text comes first; sizes are those of the spaces and of an episode."""
+    """The page begins with the world's description; sizes equal the spaces and the episode's length."""
     id, text, env = described
     assert re.findall(r"^## (.*)$", text, re.MULTILINE) == [
         "Description", "Action Space", "Observation Space", "Rewards", "Starting State", "Episode End",
@@ -47,14 +47,14 @@ def test_sections_and_sizes(described):
 
 
 def test_arguments_are_those_of_the_environment(described):
-    """By their names."""
+    """The page lists the arguments of the environment's class by name."""
     _, text, env = described
     listed = set(table(section(text, "Arguments"))) - {"name", "threads"}
     assert listed == set(inspect.signature(type(env)).parameters) - {"name"}
 
 
 def test_numbers_are_the_worlds(described):
-    """Every one by the name under which `world` changes it, with its value and a meaning."""
+    """The page lists each parameter by its name in the argument `world`, with value and meaning."""
     _, text, env = described
     values, meanings = (table(section(text, "World"), column) for column in (1, 2))
     for name, value in values.items():

@@ -1,4 +1,4 @@
-"""What every registered environment that asks for estimates promises, tested over the registry."""
+"""Guarantees of all registered estimation environments."""
 
 import gc
 import json
@@ -24,30 +24,30 @@ from short import SHORT, short
 
 @pytest.fixture(scope="module", params=ESTIMATION)
 def name(request):
-    """Every id; all tests of one id run in a row, while its meshes are kept."""
+    """Return an id; all tests of one id run in sequence, while its meshes are cached."""
     return request.param
 
 
 def test_every_id_has_a_short_version():
-    """And every short version an id: whoever registers an environment has it tested here."""
+    """Each short version has an id: all registered environments are tested here."""
     used = [short(id)["world"] for id in entries()]
     for changes in SHORT.values():
         assert any(changes is each for each in used)
 
 
 def test_gymnasium_checker_passes(name):
-    """Spaces, seeding, returned types and rendering are as gymnasium demands."""
+    """Spaces, seeding, returned types and rendering meet gymnasium's requirements."""
     check_env(make(name, render_mode="rgb_array").unwrapped)
 
 
 @pytest.mark.filterwarnings("ignore:We recommend you to use a symmetric and normalized Box action space")
 def test_stable_baselines3_checker_passes(name):
-    """Stable-baselines3 can wrap it."""
+    """The environment is compatible with stable-baselines3."""
     check_env_sb3(make(name).unwrapped)
 
 
 def test_spec_travels_as_json(name):
-    """An environment is made again from its specification in JSON."""
+    """An environment can be made from its specification in JSON."""
     env = make(name)
     again = gym.make(gym.envs.registration.EnvSpec.from_json(env.spec.to_json()))
     assert json.loads(again.spec.to_json()) == json.loads(env.spec.to_json())
@@ -56,7 +56,7 @@ def test_spec_travels_as_json(name):
 
 
 def test_world_is_that_of_the_id_but_for_the_changes(name):
-    """The lag is the id's, unless another is given."""
+    """The lag is set by the id or by an argument."""
     registered = entries()[name]
     env = make(name).unwrapped
     assert env.world == registered.world.with_changes(short(name)["world"]) != registered.world
@@ -67,7 +67,7 @@ def test_world_is_that_of_the_id_but_for_the_changes(name):
 
 @pytest.mark.parametrize("id", [PIPE, "eitbench/Pipe2DTimeVaryingVelocity-v0", "eitbench/RotatingTank2D-v0"])
 def test_same_observation_in_another_process(id, tmp_path):
-    """The seed decides, not the process: another one, which finds nothing in its cache, simulates the same bits."""
+    """An episode depends on the seed only: another process with an empty cache simulates the same bits."""
     code = ("import gymnasium as gym, eitbench\n"
             f"observation, _ = gym.make({id!r}, **{short(id)!r}).reset(seed=1)\n"
             "print(observation['voltages'].tobytes().hex())")
@@ -77,7 +77,7 @@ def test_same_observation_in_another_process(id, tmp_path):
 
 
 def test_unseeded_resets_follow_the_first_seed(name):
-    """After a seeded reset, unseeded ones draw training episodes from np_random alone; each of them comes."""
+    """After a seeded reset, unseeded ones draw all training episodes from np_random."""
     one, other = (make(name) for _ in range(2))
     for env in (one, other):
         env.reset(seed=1)
@@ -105,7 +105,7 @@ def test_types_and_lengths(name):
 
 
 def test_truth_is_not_within_reach_of_observation_or_info(name):
-    """Nothing reachable from what an agent is handed holds the episode, the world that is played or
+    """Objects reachable from observation and info do not contain the episode, its world or
     an array of the truth's size."""
     env = make(name)
     handed = [step[0] | step[4] for step in play(env, 1, noise_actions(env))]
@@ -126,13 +126,13 @@ def test_truth_is_not_within_reach_of_observation_or_info(name):
             assert n_truth not in thing.shape
             continue
         stack += vars(thing).values() if hasattr(thing, "__dict__") else gc.get_referents(thing)
-    assert len(seen) > 50                      # the walk did go into the task
+    assert len(seen) > 50                      # the search reached the task
 
 
 @pytest.mark.parametrize("name", [
     PIPE, "eitbench/Pipe2DFixedLag-v0", "eitbench/Pipe3D-v0", "eitbench/RotatingTank2D-v0"], scope="module")
 def test_frames_show_truth_estimate_and_spread(name):
-    """The picture changes with the estimate, with the spread and with the time; by kind of vessel and with a lag."""
+    """The image depends on estimate, standard deviation and time, for each kind of vessel and with a lag."""
     env = make(name, render_mode="rgb_array")
     base = env.unwrapped
     env.reset(seed=1)
@@ -155,7 +155,7 @@ def test_frames_show_truth_estimate_and_spread(name):
 
 
 def test_a_test_episode_is_said_to_be_one():
-    """Once, at the line that resets to it, whatever wraps the environment; not to who plays for scores, nor of train
+    """The warning appears once, at the line of the reset, with any wrapper, but not in evaluations or for train
     and dev seeds."""
     wrapped = make(PIPE)
     env = wrapped.unwrapped

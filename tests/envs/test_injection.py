@@ -1,4 +1,4 @@
-"""Environments in which the agent chooses the injection: what they show and pay, alone and side by side."""
+"""Injection environments: observations and rewards, single and vectorised."""
 
 import pickle
 
@@ -37,7 +37,7 @@ shown_as = pytest.mark.parametrize(("estimator", "observation"), [
 
 
 def make_many(name: str = NAME, num_envs: int = 2, mode: str = "vector_entry_point", **kwargs):
-    """Some environments with a short world, by gymnasium or by our own class."""
+    """Make environments with a short world, by gymnasium or by the built-in vector class."""
     return gym.make_vec(name, num_envs=num_envs, vectorization_mode=mode, world=world(name),
                         **{"observation": "raw"} | kwargs)
 
@@ -46,7 +46,7 @@ def make_many(name: str = NAME, num_envs: int = 2, mode: str = "vector_entry_poi
 @shown_as
 @pytest.mark.filterwarnings("ignore")
 def test_checkers_pass(name, estimator, observation):
-    """Gymnasium's and stable-baselines3's."""
+    """The checkers of gymnasium and stable-baselines3 pass."""
     check_env(make(estimator, name, observation).unwrapped, skip_render_check=True)
     check_env_sb3(make(estimator, name, observation).unwrapped)
 
@@ -55,7 +55,7 @@ def test_checkers_pass(name, estimator, observation):
     *((name, *shown) for name in INJECTION for shown in [("reduced", "scaled"), ("reduced", "raw"), ("none", "raw")]),
     *((name, "full", "raw") for name in (NAME, INFLOW, TANK))])        # the others differ before the filter only
 def test_contract(name, estimator, observation):
-    """Lengths, types, fresh arrays, spaces; pickled it plays the same; its spec travels as JSON."""
+    """Lengths, types, new arrays and spaces are valid; pickling and the spec in JSON conserve the environment."""
     env = make(estimator, name, observation)
     actions = some_actions(env)
     steps = play(env, 1, actions)
@@ -82,9 +82,9 @@ def test_contract(name, estimator, observation):
 
 
 def test_voltages_are_those_of_the_pair():
-    """Pair (i, j) drives its current in at i and out at j: V = 𝓡 I plus this step's noise, scaled to the readings.
+    """The current of pair (i, j) enters at i and leaves at j: V = 𝓡 I plus noise scaled to the measurements.
 
-    Where nothing estimates nothing is paid, and there is no error.
+    Without an estimator the reward is 0 and the error is None.
     """
     env = make()
     base = env.unwrapped
@@ -107,7 +107,7 @@ def test_voltages_are_those_of_the_pair():
 
 
 def test_first_frame_is_the_worlds_own():
-    """With an estimator the agent takes over after a frame of the cycle, whose voltages it is shown."""
+    """The agent of a filter begins after a frame of the cycle; observations contain its voltages."""
     env = make("reduced")
     observation, _ = env.reset(seed=3)
     played = env.unwrapped.world
@@ -120,7 +120,7 @@ def test_first_frame_is_the_worlds_own():
 @pytest.mark.parametrize("name", [NAME, INFLOW])
 @pytest.mark.parametrize("estimator", ["reduced", "full"])
 def test_reward_is_the_decrease_of_the_error(estimator, name):
-    """The pay equals ∫(ĉ_bh − c)²/∫c² − ∫(ĉ − c)²/∫c², both of nodal values integrated on the truth's mesh."""
+    """The reward equals ∫(ĉ_bh − c)²/∫c² − ∫(ĉ − c)²/∫c², nodal values integrated on the truth's mesh."""
     env = make(estimator, name)
     base = env.unwrapped
     actions = some_pairs()
@@ -150,13 +150,13 @@ def test_reward_is_the_decrease_of_the_error(estimator, name):
 @every
 @shown_as
 def test_side_by_side_as_one_by_one(name, estimator, observation):
-    """18 environments at once show, to the bit, what 18 alone show, over episodes' ends; threads change nothing."""
+    """18 vectorised and 18 single environments are bit-identical, also after an episode's end and with threads."""
     kwargs = {"num_envs": 18, "estimator": estimator, "episodes": 3, "observation": observation}
     envs = [make_many(name, mode="sync", **kwargs), *(make_many(name, threads=threads, **kwargs) for threads in (1, 2))]
     seeds = [k % 4 for k in range(18)]
     steps = [[env.reset(seed=seeds)] for env in envs]
     chosen = np.random.default_rng(0)
-    for _ in range(24 if estimator == "none" else 7):                 # whose episodes are shorter
+    for _ in range(24 if estimator == "none" else 7):                 # which has shorter episodes
         actions = (chosen.uniform(-1.0, 1.0, (18, 16)).astype(np.float32) if name == CURRENTS else
                    chosen.integers(120, size=18))
         for env, seen in zip(envs, steps, strict=True):
@@ -169,12 +169,12 @@ def test_side_by_side_as_one_by_one(name, estimator, observation):
                 np.testing.assert_array_equal(a, b)
             assert (other[-1]["step"] == reference[-1]["step"]).all()
     begun = sum(int(step[-1]["step"][0]) == 1 for step in steps[0])
-    assert begun >= 2                                                 # another episode was begun
+    assert begun >= 2                                                 # another episode has begun
 
 
 @pytest.mark.parametrize("name", [FAULTS, INFLOW])
 def test_with_the_full_filter_too_others_beside_change_nothing(name):
-    """An episode is the same to the bit whether it is played alone or beside another one."""
+    """An episode is bit-identical alone and together with another one."""
     alone, beside = (make_many(name, n, estimator="full") for n in (1, 2))
     shown = [(alone.reset(seed=[0])[0], beside.reset(seed=[0, 1])[0])]
     for action in (7, 40):
@@ -187,7 +187,7 @@ def test_with_the_full_filter_too_others_beside_change_nothing(name):
 
 
 def test_an_estimate_that_is_not_finite_is_an_error(monkeypatch):
-    """Nobody is paid for it, or by it: the step raises, and names the episodes."""
+    """The step raises an error that names the episodes."""
     errors = ReducedFilters.errors
 
     def broken(self, *recorded):
@@ -213,7 +213,7 @@ def test_an_estimate_that_is_not_finite_is_an_error(monkeypatch):
 
 @pytest.mark.parametrize("name", [NAME, FLOW])
 def test_frames_change_with_what_is_known(name):
-    """A picture of the last injection; without an estimator of the expected level. None without a mode."""
+    """The image shows the last injection, without an estimator the expected concentration; None without a mode."""
     pictures = []
     for estimator in ("none", "reduced"):
         env = make(estimator, name, render_mode="rgb_array").unwrapped
@@ -239,13 +239,13 @@ def test_frames_change_with_what_is_known(name):
 ])
 @pytest.mark.filterwarnings("ignore")
 def test_wrong_arguments_are_named(change, message):
-    """A wrong argument is named before anything is computed."""
+    """An invalid argument is named before any computation."""
     with pytest.raises(ValueError, match=message):
         gym.make(NAME, **change)
 
 
 def test_one_action_may_be_an_array():
-    """Of no axes, as stable-baselines3's models give it for a single observation."""
+    """The action may have no axes, like actions of stable-baselines3's models for a single observation."""
     env = make("reduced")
     steps = []
     for action in (7, np.array(7)):
@@ -257,7 +257,7 @@ def test_one_action_may_be_an_array():
 
 
 def test_wrong_actions_are_named():
-    """There are 120 pairs, and only they can be injected."""
+    """Actions other than the 120 pairs are rejected."""
     env = make().unwrapped
     env.reset(seed=1)
     message = "action must be an integer of at least 0 and at most 119"

@@ -1,4 +1,4 @@
-"""Choosing injections where the mean velocity drifts and only a region counts."""
+"""Injections with a drifting mean velocity and a region of interest."""
 
 import dataclasses
 
@@ -42,7 +42,7 @@ def env():
 
 
 def integrated(mesh, values: np.ndarray, region: tuple[float, float]) -> float:
-    """∫values² over the region, of a field linear in each cell, by its values at the middles of the sides."""
+    """Return ∫values² over the region of a field linear in each cell, by its values at the midpoints of the sides."""
     x = mesh.points[mesh.cells][..., 0]
     inside = (x.min(axis=1) > region[0] - 1e-9) & (x.max(axis=1) < region[1] + 1e-9)
     corner = values[mesh.cells[inside]]
@@ -52,7 +52,7 @@ def integrated(mesh, values: np.ndarray, region: tuple[float, float]) -> float:
 
 @pytest.mark.parametrize("estimator", ["reduced", "full"])
 def test_errors_are_those_in_the_region(estimator):
-    """Error and pay of every scored step equal integrals over the truth's cells between the two cross-sections."""
+    """Error and reward of every scored step equal integrals over the truth's cells between two cross-sections."""
     env = make(estimator, FLOW)
     base = env.unwrapped
     env.reset(seed=3)
@@ -95,7 +95,7 @@ def test_without_a_region_all_counts(env):
 
 
 def test_recordings_hold_the_integrals(monkeypatch, tmp_path):
-    """With the bits that the truth gives."""
+    """Cached integrals are bit-identical to integrals of the truth."""
     monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path))
     narrow = {"flow": {"velocity_range": [44.5, 45.5]}, "schedule": {"scored_steps": 3}}
     world = PIPE_2D_DRIFTING.with_changes(WANDERING).with_changes(narrow)
@@ -113,13 +113,13 @@ def test_recordings_hold_the_integrals(monkeypatch, tmp_path):
 ])
 @pytest.mark.filterwarnings("ignore")
 def test_wrong_arguments_are_named(change, message):
-    """A wrong argument is named before anything is computed."""
+    """An invalid argument is named before any computation."""
     with pytest.raises(ValueError, match=message):
         gym.make(FLOW, world=change)
 
 
 def test_velocity_is_a_walk_that_turns_back():
-    """Up or down by the same step, within its range, all of which it reaches; other seeds, other walks."""
+    """The velocity changes by ± the same step and covers its range; walks depend on the seed."""
     world = PIPE_2D_DRIFTING.with_changes({"flow": {"velocity_range": [4.0, 5.0]}, "schedule": {"scored_steps": 400}})
     walks = []
     for seed in range(3):
@@ -134,7 +134,7 @@ def test_velocity_is_a_walk_that_turns_back():
 
 
 def test_tables_hold_between_their_velocities(env):
-    """A(θ), the noise and dA/dθ at a velocity that is not tabulated against F(θ) itself, projected."""
+    """Compare A(θ), the noise and dA/dθ at a velocity that is not tabulated with the projected F(θ)."""
     task = env.task
     model = load_or_build_model(env.world)
     theta = 0.5 * (model.velocities[6] + model.velocities[7])
@@ -156,8 +156,8 @@ def test_tables_hold_between_their_velocities(env):
 
 
 def test_full_operator_is_the_joint_filter_of_the_baselines():
-    """On the world's own cycle: the same concentration and velocity, if the baseline linearises
-    about the level and has the same bounds."""
+    """On the world's cycle both have the same concentration and velocity, if the baseline linearises
+    about c_ref and has the same bounds."""
     env = make("full", FLOW).unwrapped
     world = env.world
     task = env.task
@@ -181,7 +181,7 @@ def test_full_operator_is_the_joint_filter_of_the_baselines():
 
 
 def test_observation_shows_the_velocity(env):
-    """Estimate and spread, last in the scaled observation; without a flow to estimate the layout is the plain one."""
+    """The velocity and its standard deviation are last in the scaled observation, if the flow is estimated."""
     observation, _ = env.reset(seed=3)
     for action in some_pairs()[:3]:
         observation = env.step(int(action))[0]
@@ -197,7 +197,7 @@ def test_observation_shows_the_velocity(env):
 
 
 def test_gains_are_of_errors_in_the_region(env):
-    """By how much a pair's measurement lowers the expected error over the region, or over what the fluid brings."""
+    """A criterion is the decrease of the expected error over the region, or over its later content, by a pair."""
     belief = Belief(env.rules, env.reset(seed=3)[0])
     for action in some_pairs()[:4]:
         belief.update(env.step(int(action))[0])

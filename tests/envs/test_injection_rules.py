@@ -1,4 +1,4 @@
-"""What may be injected, and what becomes of it in an instrument with faults."""
+"""Allowed injections, and their voltages from an instrument with faults."""
 
 import gymnasium as gym
 import numpy as np
@@ -13,7 +13,7 @@ from injection_envs import BUDGET, CURRENTS, FAULTS, make, play, some_pairs
 
 @pytest.mark.parametrize(("limit", "order"), [("L1", 1), ("L2", 2), ("Linf", np.inf)])
 def test_currents_are_projected(limit, order):
-    """They sum to zero; those within the limit are only centred, others scaled onto a pair's norm."""
+    """Currents sum to zero; within the limit they are only centred, otherwise scaled to a pair's norm."""
     rules = Rules(PIPE_2D.with_changes({"instrument": {"current_norm": limit}}))
     assert rules.limit == limit
     free = np.random.default_rng(0).uniform(-1.0, 1.0, (50, 16))
@@ -32,7 +32,7 @@ def test_currents_are_projected(limit, order):
 
 
 def test_a_pair_and_its_currents_are_the_same():
-    """The world with currents contains the one with pairs: the same voltages and estimate."""
+    """Currents of a pair give the same voltages and estimate as the pair."""
     pair = make("reduced", longer={"instrument": {"noise_floor": 2e-4}})
     free = make("reduced", CURRENTS)
     for env in (pair, free):
@@ -46,7 +46,7 @@ def test_a_pair_and_its_currents_are_the_same():
 
 
 def test_budget_is_spent_and_then_nothing_flows():
-    """Only injections count; without one, or beyond the budget, nothing is learnt."""
+    """Only injections count; without one, or beyond the budget, the estimate is not updated."""
     env = make("reduced", BUDGET, longer={"schedule": {"scored_steps": 8, "budget": 2}})
     observation, _ = env.reset(seed=1)
     left = [observation["left"][1]]
@@ -67,7 +67,7 @@ def test_budget_is_spent_and_then_nothing_flows():
 
 
 def test_dead_electrodes_read_nothing_and_carry_nothing():
-    """A broken wire reads interference; what would have to pass it does not flow; all else is 𝓡 I."""
+    """A broken wire measures interference and carries no current; other voltages are 𝓡 I."""
     instrument = Instrument(n_dead_range=(3, 3), n_failing_range=(2, 2), n_loose_range=(2, 2), interference=0.5)
     noise = instrument.noise
     assert noise == PIPE_2D.noise
@@ -107,7 +107,7 @@ def test_dead_electrodes_read_nothing_and_carry_nothing():
 
 
 def test_a_floor_adds_to_the_noise():
-    """Independent of what is read, and so in quadrature; where nothing flows it is all there is."""
+    """The noise floor adds in quadrature; without a current it is the only noise."""
     rng = np.random.default_rng(1)
     instrument = Instrument(noise_floor=2e-3)
     root = rng.normal(size=(16, 16))
@@ -126,7 +126,7 @@ def test_a_floor_adds_to_the_noise():
 
 
 def test_faults_depend_on_the_seed_alone_and_are_shown_by_doubt():
-    """The same seed has the same faults; electrodes in doubt after a while are those with a fault."""
+    """Equal seeds have equal faults; high fault scores indicate electrodes with a fault after some steps."""
     faults = {"n_dead_range": [3, 3], "n_failing_range": [0, 0], "n_loose_range": [0, 0]}
     longer = {"instrument": faults, "schedule": {"scored_steps": 24}}
     env = make("reduced", FAULTS, longer=longer)
@@ -152,7 +152,7 @@ def test_faults_depend_on_the_seed_alone_and_are_shown_by_doubt():
     (BUDGET, {"schedule": {"budget": -1}}, "budget must be"),
 ])
 def test_wrong_rules_are_named(name, change, message):
-    """Of faults and budgets too."""
+    """Invalid faults and budgets are named."""
     with pytest.raises(ValueError, match=message):
         gym.make(name, world=change)
 
@@ -160,7 +160,7 @@ def test_wrong_rules_are_named(name, change, message):
 @pytest.mark.parametrize("kind", [np.float16, np.float32, np.float64])
 @pytest.mark.parametrize("limit", ["L1", "L2", "Linf"])
 def test_the_largest_currents_are_those_at_the_bounds(kind, limit):
-    """Whatever is finite is injected within the instrument's limit; nothing overflows."""
+    """Finite currents are scaled to the instrument's limit without overflow."""
     largest = np.finfo(kind).max
     longer = {"instrument": {"current_norm": limit}}
     env, other = (make("reduced", CURRENTS, longer=longer).unwrapped for _ in range(2))

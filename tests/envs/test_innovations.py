@@ -1,4 +1,4 @@
-"""What the filter inside says of itself, for scores: how far readings are from its predictions."""
+"""Innovations of the filter inside injection environments, for scores."""
 
 import copy
 
@@ -12,11 +12,11 @@ from injection_envs import BUDGET, FAULTS, FLOW, NAME, TANK, make, some_pairs
 
 
 def predicted(filter_, estimator: str, n: int):
-    """(mean, X -> Γ X) of the concentration's next state, in the filter's own coordinates."""
+    """Return (mean, X -> Γ X) of the next state of the concentration, in the filter's coordinates."""
     moved = copy.deepcopy(filter_)
     moved.predict()
     if estimator == "reduced":
-        r = moved.states.basis.shape[1]                             # behind it the velocity
+        r = moved.states.basis.shape[1]                             # followed by the velocity
         covariance = moved.covariance[0, :r, :r].astype(float)
         return moved.mean[0, :r].astype(float), lambda X: covariance @ X
     return moved.concentration, lambda X: moved.covariance.times(X)[:n]
@@ -27,7 +27,7 @@ def predicted(filter_, estimator: str, n: int):
     (FLOW, "full"), (TANK, "reduced"), (TANK, "full")])
 def test_innovations_are_those_of_the_tasks_matrices(name, estimator):
     """ν = V − R(c*) − J (ĉ − c*) and S = J Γ Jᵀ + noise in volts, from the measured voltages, of
-    the readings within the gate; none of an injection of which more than a third is beyond."""
+    accepted measurements; None for an injection with more than a third rejected."""
     env = make(estimator, name).unwrapped
     env.reset(seed=5)
     core, task, rules = env.core, env.task, env.rules
@@ -72,8 +72,8 @@ def test_innovations_are_those_of_the_tasks_matrices(name, estimator):
 
 
 def nis_of(random, noise: float) -> float:
-    """NIS/m of reduced filters of 32 episodes over 40 injections, whose voltages are drawn from
-    their own model, with the noise so many times as large."""
+    """Return NIS/m of reduced filters of 32 episodes over 40 injections; voltages are drawn from
+    the filter's model, with the noise multiplied by a factor."""
     env = make("reduced").unwrapped
     world, rules, B = env.world, env.rules, 32
     shared = SharedData.of(rules)
@@ -104,7 +104,7 @@ def nis_of(random, noise: float) -> float:
 
 
 def test_nis_of_a_consistent_filter_averages_one(monkeypatch):
-    """Innovations of a filter that knows its model are independent: the mean of 20,480 squares is
+    """Innovations of a filter with the correct model are independent: the mean of 20,480 squares is
     within four of its standard deviations of 1, and is not where the noise is twice as large."""
     monkeypatch.setattr(LinearisationTable, "nearest_indices", lambda self, frames, gate: [0] * len(frames))
     random = np.random.default_rng(0)

@@ -1,4 +1,4 @@
-"""Wrong arguments and estimates of estimation environments are named."""
+"""Invalid arguments and estimates of estimation environments are named."""
 
 import gymnasium as gym
 import numpy as np
@@ -29,13 +29,13 @@ STIRRED, STILL = "eitbench/RotatingTank2D-v0", "eitbench/StationaryTank2D-v0"
     (STIRRED, {"world": {"region": [0.1, 0.2]}}, "region must be None in a RoundTank"),
 ])
 def test_wrong_arguments_are_named(id, change, message):
-    """A wrong argument is named before anything is computed."""
+    """An invalid argument is named before any computation."""
     with pytest.raises(ValueError, match=message):
         gym.make(id, **change)
 
 
 def bad(n: int, place: int, value: float) -> np.ndarray:
-    """(n,) thirties but for one."""
+    """Return (n,) thirties except one."""
     action = np.full(n, 30.0)
     action[place] = value
     return action
@@ -54,7 +54,7 @@ def bad(n: int, place: int, value: float) -> np.ndarray:
     (UNKNOWN, bad(1702, -1, 451.0), "action must lie within ±450 m/s, got 451"),
 ])
 def test_wrong_actions_are_named(id, action, message):
-    """An estimate that is none is refused with what came and what was expected."""
+    """An invalid estimate is rejected with its value and the expectation."""
     env = make(id).unwrapped
     env.reset(seed=1)
     with pytest.raises(ValueError, match=message):
@@ -63,7 +63,7 @@ def test_wrong_actions_are_named(id, action, message):
 
 @pytest.mark.parametrize("ask", ["truth", "true_velocity", "privileged_info"])
 def test_there_is_nothing_to_show_before_a_reset(ask):
-    """Nor is there a step to take."""
+    """Rendering, steps and errors require a reset."""
     env = make(PIPE).unwrapped
     with pytest.raises(gym.error.ResetNeeded, match=rf"call reset\(\) before {ask}\(\)"):
         getattr(env, ask)()

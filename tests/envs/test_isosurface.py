@@ -1,4 +1,4 @@
-"""Isosurfaces are where the interpolant has their value, and as large as they should be."""
+"""Isosurfaces have the position and the area of the interpolant's level sets."""
 
 import numpy as np
 import pytest
@@ -9,14 +9,14 @@ MESH = extrude(uniform_disc(1.0, 8), np.linspace(-1.0, 1.0, 17))
 
 
 def area(triangles):
-    """Of all triangles together."""
+    """Return the total area of the triangles."""
     a, b = triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]
     return 0.5 * np.linalg.norm(np.cross(a, b), axis=1).sum()
 
 
 @pytest.mark.parametrize("direction", [(0.0, 0.0, 1.0), (1.0, 0.0, 0.0), (0.3, -0.5, 0.8)])
 def test_surface_of_a_linear_function_is_a_plane(direction):
-    """Every corner lies on the plane, and across the pipe the plane's area is the section's."""
+    """Every corner is on the plane, and a plane across the pipe has the area of the section."""
     values, level = MESH.points @ direction, 0.0137
     triangles = isosurface(MESH, values, level)
     np.testing.assert_allclose(triangles @ direction, level, atol=1e-12)
@@ -26,12 +26,12 @@ def test_surface_of_a_linear_function_is_a_plane(direction):
 
 
 def test_surface_of_a_distance_is_a_sphere():
-    """Its area comes close to 4πr², from below."""
+    """The area approaches 4πr² from below."""
     triangles = isosurface(MESH, np.linalg.norm(MESH.points, axis=1), 0.7)
     assert 0.93 * 4 * np.pi * 0.49 < area(triangles) < 4 * np.pi * 0.49
 
 
 def test_nothing_beyond_the_extremes():
-    """A level that is not reached has no surface."""
+    """A level outside the range of values has no surface."""
     for level in (2.0, -2.0):
         assert isosurface(MESH, MESH.points[:, 0], level).shape == (0, 3, 3)

@@ -1,4 +1,4 @@
-"""The filters inside injection environments that have learned what flows in."""
+"""Filters inside injection environments with a fitted inflow prior."""
 
 import numpy as np
 import pytest
@@ -27,7 +27,7 @@ def begun(estimator: str, seed: int = 3):
 
 
 def test_full_one_is_that_of_the_baseline():
-    """Step by step what `inflow_filter`, as in log_inflow_filter, makes of the same voltages."""
+    """Estimates equal `inflow_filter`, as in log_inflow_filter, at each step."""
     env, observation = begun("full")
     world, task = env.unwrapped.world, env.unwrapped.task
     core = env.unwrapped.core
@@ -47,7 +47,7 @@ def test_full_one_is_that_of_the_baseline():
 
 
 def test_reduced_one_is_close_to_the_full_one():
-    """Means differ by a tenth of the filter's own standard deviation at most, root mean square."""
+    """The RMS difference of the means is at most a tenth of the filter's standard deviation."""
     (full, _), (reduced, _) = begun("full"), begun("reduced")
     for action in some_pairs()[:full.unwrapped.world.n_steps - 16]:
         for env in (full, reduced):
@@ -59,16 +59,16 @@ def test_reduced_one_is_close_to_the_full_one():
 
 @pytest.fixture(scope="module")
 def parts():
-    """The steady response of a short world, its prior and the reduced model of both, in double precision."""
+    """Return the steady response of a short world, its prior and the reduced model of both, in double precision."""
     world = make("none", INFLOW).unwrapped.world
     response, prior = steady_response(make_task(world).transport), fit_world_prior(world)
     return response, prior, inflow_model(response, prior)
 
 
 def test_reduced_states_carry_inflows_as_the_flow_does(parts):
-    """Concentrations of inflows drawn from the prior, whose remainders drive the state, are those of
-    the response but for 2 % of what they deviate from the level, root mean square; with D values of x
-    fewer than the regression has, there would be none."""
+    """Concentrations of inflows from the prior, whose remainders drive the state, equal
+    the response within 2 % (RMS) of their deviation from c_ref; with D values of x
+    fewer than in the regression they would be exact."""
     response, prior, model = parts
     states = InflowStates(model)
     (D,), (K,) = model.regression.shape, response.weights.shape[1:2]
@@ -80,7 +80,7 @@ def test_reduced_states_carry_inflows_as_the_flow_does(parts):
     zero = np.zeros((1, h + D * r, h + D * r))
     for t in range(150):
         mean, _ = states.propagate(mean, zero)
-        mean[0, h:h + r] = x[t]                                     # what no one could predict
+        mean[0, h:h + r] = x[t]                                     # unpredictable part
         if t < K:
             continue
         past = deviation[t - K + 1:t + 1][::-1]
@@ -91,7 +91,7 @@ def test_reduced_states_carry_inflows_as_the_flow_does(parts):
 
 
 def test_reduced_derivatives_are_those_of_the_steps(parts):
-    """Central differences of mean and coordinates; and the covariance moves with them."""
+    """Derivatives equal central differences of mean and coordinates, also for the covariance."""
     model = parts[2]
     states, rng = InflowStates(model), np.random.default_rng(1)
     mean = 0.3 * rng.standard_normal((2, len(model.initial)))
@@ -114,8 +114,8 @@ def test_reduced_derivatives_are_those_of_the_steps(parts):
 
 
 def test_initial_covariance_stays_as_it_is(parts):
-    """Before anything is measured the state is stationary: about x = 0 a step changes nothing but
-    what the pipe forgets in it."""
+    """Before the first measurement the state is stationary: about x = 0 a step changes only
+    the contribution that leaves the pipe."""
     states = InflowStates(parts[2])
     mean, covariance = states.initial()
     after = states.propagate(mean[None], covariance[None])[1][0]
@@ -123,7 +123,7 @@ def test_initial_covariance_stays_as_it_is(parts):
 
 
 def test_node_voltages_are_those_of_all_nodes(parts):
-    """Of concentrations that inflows make: voltages within a fifth of the noise of the complete
+    """For concentrations from inflows, voltages are within a fifth of the noise of the complete
     electrode model, and derivatives along directions that inflows take within 3 %."""
     response, prior, model = parts
     world = make("none", INFLOW).unwrapped.world
@@ -149,8 +149,8 @@ def test_node_voltages_are_those_of_all_nodes(parts):
 
 
 def test_what_a_pair_teaches_is_foretold():
-    """The criterion's variance is what the filter then has, as long as no reading is left out; and
-    gains are by how much the expected error falls."""
+    """The criterion's variance equals the filter's variance after the injection, if all measurements are accepted;
+    criteria are the decrease of the expected error."""
     env, observation = begun("reduced")
     belief = Belief(env.unwrapped.rules, observation)
     rtol = 1e-3                                            # the filter has single precision
@@ -167,7 +167,7 @@ def test_what_a_pair_teaches_is_foretold():
 
 
 def test_expected_error_is_that_of_the_spread():
-    """Integrated over the pipe, the variances shown are the expected squared error of the state
+    """Integrated over the pipe, the observed variances are the expected squared error of the state
     that is predicted without a measurement."""
     env, observation = begun("reduced")
     belief = Belief(env.unwrapped.rules, observation)
@@ -184,7 +184,7 @@ def test_expected_error_is_that_of_the_spread():
 
 @pytest.mark.parametrize("name", [FAULTS, BUDGET])
 def test_other_worlds_may_know_the_inflow_too(name):
-    """By an argument; what is believed is no part of the world, nor of its episodes."""
+    """An argument selects the prior; world and episodes do not depend on it."""
     env = make("reduced", name, inflow="learned")
     assert env.unwrapped.world == make("none", name).unwrapped.world
     env.reset(seed=1)
@@ -199,6 +199,6 @@ def test_other_worlds_may_know_the_inflow_too(name):
     (TANK, "learned", "inflow must be 'white' for a target without inflow"),
 ])
 def test_wrong_inflows_are_named(name, inflow, message):
-    """Before anything is computed."""
+    """An invalid prior is named before any computation."""
     with pytest.raises(ValueError, match=message):
         make("reduced", name, inflow=inflow)

@@ -1,4 +1,4 @@
-"""How long an episode is stands in the spec, and changes nothing in how it ends."""
+"""The spec contains the length of an episode, without an effect on its end."""
 
 import eitbench  # noqa: F401 (registers the ids)
 import gymnasium as gym
@@ -9,8 +9,8 @@ from short import short
 
 @pytest.mark.parametrize("name", ["eitbench/Pipe2D-v0", "eitbench/Pipe2DSmoothing-v0", "eitbench/Pipe2DInjection-v0"])
 def test_the_spec_says_how_many_steps_there_are(name):
-    """Of the variant that is played, at the end of which the state is terminal and nothing is cut off. Gymnasium's own
-    wrapper, round what is made from such a spec, changes only the other flag."""
+    """The last step of a variant is terminated and not truncated. Gymnasium's
+    wrapper around an environment from such a spec changes only the flag truncated."""
     env = gym.make(name, **short(name))
     assert gym.spec(name).max_episode_steps is None
     steps = env.spec.max_episode_steps

@@ -13,12 +13,12 @@ PAIRS = electrode_pairs(16).tolist()
 
 
 def number(currents: np.ndarray) -> int:
-    """The action that injects these currents of a pair."""
+    """Return the action that injects these currents of a pair."""
     return PAIRS.index([int(currents.argmax()), int(currents.argmin())])
 
 
 def test_reduced_one_is_close_to_the_baselines():
-    """On the world's own cycle it comes within 1 mol/m³ (rms) of the full filter's estimate at every scored step."""
+    """On the world's cycle it is within 1 mol/m³ (RMS) of the full filter's estimate at every scored step."""
     env = make("reduced")
     world = env.unwrapped.world
     task = make_task(world)
@@ -40,7 +40,7 @@ def test_reduced_one_is_close_to_the_baselines():
 
 
 def test_full_one_is_that_of_the_baselines():
-    """On the world's own cycle: the same as `kalman_filter` about the same level, to 1e-7 of a std."""
+    """On the world's cycle it equals `kalman_filter` about the same c_ref, to 1e-7 of a std."""
     env = make("full")
     world = env.unwrapped.world
     task = env.unwrapped.task
@@ -59,7 +59,7 @@ def test_full_one_is_that_of_the_baselines():
 
 
 def test_grid_of_the_full_one_is_that_of_its_covariance():
-    """Patch spreads are those of the patch averages under the exact covariance, seen through unit vectors."""
+    """Standard deviations of the grid equal patch averages under the full covariance."""
     env = make("full")
     env.reset(seed=5)
     shown = env.step(7)[0]["std"]

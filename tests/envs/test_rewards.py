@@ -1,4 +1,4 @@
-"""What estimates are paid, against integrals on the truth's mesh."""
+"""Rewards of estimates against integrals on the truth's mesh."""
 
 import numpy as np
 import pytest
@@ -11,12 +11,12 @@ each_velocity = pytest.mark.parametrize("name", VELOCITY)
 
 @pytest.fixture(scope="module", params=AT_HOME)
 def name(request):
-    """Every id; all tests of one id run in a row, while its meshes are kept."""
+    """Return an id; all tests of one id run in sequence, while its meshes are cached."""
     return request.param
 
 
 def test_action_is_one_number_a_node_and_one_a_parameter_of_the_flow(name):
-    """(n + k,), symmetric about zero: ten times the expected concentration, and ten times the velocity."""
+    """The action space (n + k,) is symmetric about zero: ten times the expected concentration and velocity."""
     env = make(name)
     task = env.unwrapped.task
     n = task.mesh.n_nodes
@@ -31,10 +31,10 @@ def test_action_is_one_number_a_node_and_one_a_parameter_of_the_flow(name):
 
 
 def test_reward_is_minus_the_relative_error_of_the_state_asked_for(name):
-    """At step i the state i − lag is scored, if it lies past the warm-up; the true state at the nodes earns about 0.
+    """Step i scores the state i − lag after the warm-up; the true state at the nodes has a reward of about 0.
 
-    What it earns is what the coarser mesh cannot hold, computed here on the truth's mesh; half as much again errs by a
-    quarter. The flow that fits best is given with it, where one is asked for.
+    Its reward is the projection error on the coarser mesh, computed here on the truth's mesh; 1.5 times the state has
+    an error of a quarter. The best fit of the flow is part of the action, if it is requested.
     """
     env = make(name)
     base = env.unwrapped
@@ -65,9 +65,9 @@ def test_reward_is_minus_the_relative_error_of_the_state_asked_for(name):
 
 @each_velocity
 def test_reward_has_a_second_term_for_the_flow(name):
-    """−∫(v̂ − v)²/∫v² is added: nothing for the best fit, −1 for none and for twice the flow, else as by quadrature.
+    """−∫(v̂ − v)²/∫v² is added: 0 for the best fit, −1 for 0 and for twice the flow, else as by quadrature.
 
-    ∫v̂ v is that of the recorded profile; the concentration is the same throughout, so that differences are the flow's.
+    ∫v̂ v uses the cached profile; the concentration is constant, so that differences are due to the flow.
     """
     base = make(name).unwrapped
     base.reset(seed=1)
@@ -89,7 +89,7 @@ def test_reward_has_a_second_term_for_the_flow(name):
     terms = {label: -(rewards + concentration)[scored] for label, rewards in earned.items()}
     squared = (true**2 @ model.weights)[scored]
     np.testing.assert_allclose(terms["none"], 1.0, atol=1e-7)
-    # no combination of three profiles is the skewed truth
+    # the skewed truth is not a combination of three profiles
     limit = 2e-4 if model.n_parameters > 1 else 1e-7
     assert (terms["best"] < limit).all()
     assert (terms["best"] > -1e-7).all()
@@ -102,7 +102,7 @@ def test_reward_has_a_second_term_for_the_flow(name):
 
 
 def test_what_is_revealed_is_the_episode(name):
-    """References are shown the whole record, which is what an agent sees step by step, and the flow that there was."""
+    """Oracles receive all observations of the episode and the true flow."""
     base = make(name).unwrapped
     seen = [base.reset(seed=1)[0]]
     revealed = base.privileged_info()

@@ -1,4 +1,4 @@
-"""Many environments at once are the same environments, one beside the other."""
+"""Vectorised environments equal scalar environments."""
 
 import pickle
 from itertools import combinations
@@ -19,18 +19,18 @@ from short import PIPE as CHANGES
 from short import PLAIN, short
 
 LAGS = [name for name in PLAIN if name in ESTIMATION]
-"""The plain pipe with its three lags; what does not depend on the world is tested on these."""
+"""The plain pipe with its three lags, for properties that do not depend on the world."""
 TINY = PIPE_2D.with_changes(CHANGES)
-"""Seven measurements, of which five are scored."""
+"""Seven measurements; five are scored."""
 
 
 def make(name=PIPE, num_envs=3, mode="vector_entry_point", **kwargs):
-    """The vectorised environment on the id's short world, with three training episodes."""
+    """Make the vectorised environment on the id's short world, with three training episodes."""
     return gym.make_vec(name, num_envs=num_envs, vectorization_mode=mode, **short(name) | {"episodes": 3} | kwargs)
 
 
 def actions_for(envs, steps, seed=0):
-    """Meaningless estimates: near the background, at it, and anywhere in the action space."""
+    """Return meaningless estimates: near the background, at it, and anywhere in the action space."""
     rng = np.random.default_rng(seed)
     shape = envs.action_space.shape
     near = 30.0 + rng.normal(size=(steps, *shape))
@@ -40,7 +40,7 @@ def actions_for(envs, steps, seed=0):
 
 
 def play(envs, actions, **how):
-    """(observation, rewards, terminations, truncations, infos) of a reset and of every step after it."""
+    """Return (observation, rewards, terminations, truncations, infos) of a reset and of all later steps."""
     observation, info = envs.reset(**how)
     nothing = np.zeros(envs.num_envs)
     first = observation, nothing, nothing != 0, nothing != 0, info
@@ -48,13 +48,13 @@ def play(envs, actions, **how):
 
 
 def assert_same_array(one, other):
-    """Equal in type, shape and every bit."""
+    """Require equal types, shapes and bits."""
     assert type(one) is type(other) is np.ndarray
     assert (one.dtype, one.shape, one.tobytes()) == (other.dtype, other.shape, other.tobytes())
 
 
 def assert_same_play(one, other):
-    """All equal to the bit, but for rewards, which are sums in another order."""
+    """Require bit-identical values, except rewards, whose summation order differs."""
     assert len(one) == len(other)
     for mine, theirs in zip(one, other, strict=True):
         for a, b in ((mine[0], theirs[0]), (mine[4], theirs[4])):
@@ -69,7 +69,7 @@ def assert_same_play(one, other):
 
 @pytest.mark.parametrize(("name", "num_envs"), [(PIPE, 1), *((name, 5) for name in AT_HOME)])
 def test_same_as_so_many_scalar_environments(name, num_envs):
-    """Over three whole episodes, of which two begin by themselves, it is gymnasium's SyncVectorEnv."""
+    """Over three episodes, two of them after an autoreset, it equals gymnasium's SyncVectorEnv."""
     mine = make(name, num_envs)
     sync = make(name, num_envs, "sync")
     assert isinstance(mine.unwrapped, estimation.EstimationVectorEnv)
@@ -96,7 +96,7 @@ def test_same_as_so_many_scalar_environments(name, num_envs):
 
 @pytest.mark.parametrize("name", LAGS)
 def test_later_resets_are_those_of_scalar_environments(name):
-    """Sequences of seeds of any kind, with gaps that are drawn, resets in mid-episode or by no seed."""
+    """Resets with any sequence of seeds, partly None, during an episode or without a seed, are equal."""
     mine = make(name)
     sync = make(name, mode="sync")
     seeds = [4, 0, 9], None, [None, 7, None], 2, None, (1, 1, None), np.int64(5)
@@ -107,7 +107,7 @@ def test_later_resets_are_those_of_scalar_environments(name):
 
 
 def test_seed_names_the_episode():
-    """Environment k plays episode s + k, or that of the list."""
+    """Environment k begins episode s + k, or the k-th of a list."""
     envs = make()
     for seed, episodes in ((4, [4, 5, 6]), ([8, 1, 8], [8, 1, 8])):
         observation, _ = envs.reset(seed=seed)
@@ -118,7 +118,7 @@ def test_seed_names_the_episode():
 
 
 def test_without_a_seed_training_episodes_are_drawn():
-    """Never anything but the first ``episodes``, each of them at some time, environments apart."""
+    """All of the first ``episodes`` are drawn and no others, separately for each environment."""
     envs = make(num_envs=4)
     first = [simulate(TINY, number).voltages(1, TINY.currents[0], TINY) for number in range(3)]
     drawn = []
@@ -127,13 +127,13 @@ def test_without_a_seed_training_episodes_are_drawn():
         near = [[np.allclose(row, one, rtol=1e-12) for one in first] for row in voltages]
         assert np.sum(near) == 4
         drawn.append([row.index(True) for row in near])
-    assert {number for row in drawn for number in row} == {0, 1, 2}     # but once in 10⁸ runs
+    assert {number for row in drawn for number in row} == {0, 1, 2}     # fails once in 10⁸ runs
     assert len(set(zip(*drawn, strict=True))) > 1
 
 
 @pytest.mark.parametrize("name", LAGS)
 def test_observations_are_fresh_and_within_their_space(name):
-    """Whoever scribbles over what he was given changes nothing of what comes later."""
+    """Writing to an observation does not change later ones."""
     envs = make(name)
     actions = actions_for(envs, 30)
     untouched = play(envs, actions, seed=1)
@@ -156,7 +156,7 @@ def test_observations_are_fresh_and_within_their_space(name):
 
 @pytest.mark.parametrize("name", LAGS)
 def test_made_again_from_its_specification(name):
-    """From its own EnvSpec, through JSON, from that of the scalar environment, or pickled."""
+    """An environment can be made from its EnvSpec, from JSON, from the scalar environment's spec, or by pickle."""
     envs = make(name)
     actions = actions_for(envs, 20)
     played = play(envs, actions, seed=1)
@@ -172,7 +172,7 @@ def test_made_again_from_its_specification(name):
 
 @pytest.mark.parametrize("seed", [[], [1, 2], [1, 2, 3, 4], np.arange(2)])
 def test_wrong_number_of_seeds_is_named(seed):
-    """One for each environment, or one integer for all; the episode that was being played goes on."""
+    """Seeds are one per environment or one integer; otherwise the present episode continues."""
     envs = make()
     actions = actions_for(envs, 3)
     played = play(envs, actions, seed=1)
@@ -184,7 +184,7 @@ def test_wrong_number_of_seeds_is_named(seed):
 
 
 def test_reset_of_some_is_refused():
-    """All begin and end together; other options are none of its business."""
+    """All environments begin and end together; other options are ignored."""
     envs = make()
     actions = actions_for(envs, 2)
     played = play(envs, actions, seed=1, options={})
@@ -195,7 +195,7 @@ def test_reset_of_some_is_refused():
 
 
 def test_step_needs_a_reset():
-    """Before the first one nothing is played."""
+    """A step before the first reset is rejected."""
     envs = make()
     with pytest.raises(gym.error.ResetNeeded, match=r"call reset\(\) before step\(\)"):
         envs.step(actions_for(envs, 1)[0])
@@ -214,7 +214,7 @@ LARGE[2, 7] = -250.1
     ("thirty", "action must be an array of numbers"),
 ])
 def test_wrong_actions_are_named_and_change_nothing(action, message):
-    """Refused with what came and what was expected; a better one can then be tried."""
+    """An invalid action is rejected with its value and the expectation; a valid one is accepted afterwards."""
     envs = make()
     actions = actions_for(envs, 7)
     played = play(envs, actions, seed=1)
@@ -229,7 +229,7 @@ def test_wrong_actions_are_named_and_change_nothing(action, message):
 
 @pytest.mark.parametrize("kind", ["float32", "list", "Fortran", "read-only"])
 def test_actions_of_any_kind_of_number_count(kind):
-    """A network's single precision, lists and any memory layout are the same estimates."""
+    """Single precision, lists and any memory layout are accepted as estimates."""
     envs = make()
     drawn = np.random.default_rng(5).uniform(20.0, 40.0, (3, 1701))
     estimates = drawn.astype(np.float32).astype(float)
@@ -244,14 +244,14 @@ def test_actions_of_any_kind_of_number_count(kind):
 
 @pytest.mark.parametrize("seed", [1.5, True, [1.7, 2, 3], [True, False, True], np.array([1.5, 2.0, 3.0]), "ab"])
 def test_seeds_that_would_be_cast_are_refused(seed):
-    """As the scalar environment refuses them."""
+    """Invalid seeds are rejected as in the scalar environment."""
     with pytest.raises(ValueError, match="seed must be"):
         make().reset(seed=seed)
 
 
 @pytest.mark.parametrize("change", [{"num_envs": 0}, {"episodes": 0}, {"lag": 99}, {"lag": "x"}])
 def test_wrong_arguments_are_named_before_anything_is_computed(change, monkeypatch):
-    """No mesh is built to find out that lag is wrong."""
+    """An invalid lag is rejected before meshes are built."""
     monkeypatch.setattr(estimation, "scoring_constants", None)
     asked = {"num_envs": 2, "world": {"flow": {"mean_velocity": 44.0}}} | change
     with pytest.raises(ValueError, match=f"{next(iter(change))} must be"):

@@ -1,4 +1,4 @@
-"""What the leaderboard makes of an estimated flow, against what the environment pays for it."""
+"""Scores of an estimated flow against the rewards of the environment."""
 
 from types import SimpleNamespace
 
@@ -13,9 +13,9 @@ from estimation_envs import PIPE, SKEWED, VELOCITY, make
 @pytest.mark.parametrize("name", VELOCITY)
 @pytest.mark.parametrize("said", [None, 40.0])
 def test_leaderboard_scores_what_is_rewarded(name, said, monkeypatch):
-    """ẽ_c + ẽ_v of the leaderboard is minus the mean reward of what it plays.
+    """ẽ_c + ẽ_v of the leaderboard equals minus the mean reward.
 
-    Who says nothing of the flow is taken to say what is believed of it at first.
+    Without an estimate of the flow its prior mean is scored.
     """
     base = make(name).unwrapped
     task = base.task
@@ -46,7 +46,7 @@ def test_leaderboard_scores_what_is_rewarded(name, said, monkeypatch):
     (SKEWED, r"Estimate.velocity must have shape \(3,\)"),
 ])
 def test_flow_is_refused_where_it_is_not_asked_for(id, message):
-    """A velocity in the plain pipe is a mistake, and so is one with too few numbers where it is asked for."""
+    """A velocity is rejected if it is not requested or has too few numbers."""
     base = make(id).unwrapped
     said = Estimate(np.full(base.task.mesh.n_nodes, 31.0), velocity=np.array([4.5]))
     estimator = SimpleNamespace(update=lambda *_: said)

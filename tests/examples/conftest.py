@@ -1,4 +1,4 @@
-"""Our wheel and that of the example, built once and installed where there is no checkout."""
+"""Wheels of eitbench and the example, built once and installed outside the checkout."""
 
 import os
 import subprocess
@@ -14,8 +14,8 @@ ROOT = Path(__file__).parents[2]
 
 @pytest.fixture(scope="session")
 def installed(tmp_path_factory):
-    """Runs commands in a fresh virtual environment, into which two wheels were installed: ours and
-    that of the example. What they need comes from here."""
+    """Run commands in a new virtual environment with two installed wheels, eitbench and
+    the example. Dependencies come from the present environment."""
     folder = tmp_path_factory.mktemp("fresh")
     pip = [sys.executable, "-m", "pip", "--disable-pip-version-check", "-q"]
     subprocess.run([*pip, "wheel", "--no-deps", "--no-build-isolation", "-w", folder / "wheels", ROOT,

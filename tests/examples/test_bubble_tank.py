@@ -1,4 +1,4 @@
-"""A package from outside: its world, method and score do what ours do, and no file of ours is touched."""
+"""A third-party package: its world, method and score work like built-in ones, without changes to eitbench."""
 
 import csv
 import json
@@ -15,7 +15,7 @@ def eitbench(installed, *arguments):
 
 
 def test_worlds_are_known_without_being_imported(installed):
-    """`gym.make`, vectors and pages, by the id alone."""
+    """`gym.make`, vectorised environments and pages need the id only."""
     said = installed("-c", f"""
 import eitbench
 import gymnasium as gym
@@ -31,8 +31,8 @@ print(eitbench.describe_environment({ID!r}))
 
 
 def test_method_and_score_make_a_record_and_a_board(installed):
-    """Its tracker beats the floor, its score is in the record, in the CSV and in `compare`; what was
-    submitted is true."""
+    """Its tracker is better than the naive baseline, its score is in the record, the CSV and `compare`, and the
+    submission is verified."""
     results, records = installed.folder / "results", installed.folder / "boards" / "records"
     for method in ("homogeneous", "bubble_tracker", "gauss_newton"):
         eitbench(installed, "submit", "--baseline", method, "--env", ID, "--seeds", "test:0-1",
@@ -58,7 +58,7 @@ def test_method_and_score_make_a_record_and_a_board(installed):
 
 
 def test_policies_and_pictures(installed):
-    """Our policies play its world, and an episode is drawn."""
+    """Built-in policies run on its world, and an episode is rendered."""
     said = eitbench(installed, "run", "--env", INJECTION, "--policy", "random_pair", "--policy",
                     "opposite", "--seeds", "dev:0-1", "--estimator", "reduced",
                     "--out", str(installed.folder / "played"))

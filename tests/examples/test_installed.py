@@ -1,4 +1,4 @@
-"""What an installed package can do in an empty folder: every command, and what the README shows."""
+"""An installed package in an empty folder: all commands, and the examples of the README."""
 
 import json
 import re
@@ -42,7 +42,7 @@ COMMANDS = [
     (("fit", "model", "--env", "eitbench/Pipe2D-v0", "--seeds", "train:0-1", "-o", "model.npz"), "model.npz: "),
     (("estimate", "--help"), "vessel"),
 ]
-"""Words, and what is said when it has worked."""
+"""Command-line arguments, and a part of the output of a successful run."""
 ONE_PROCESS = """
 import json
 from pathlib import Path
@@ -50,17 +50,17 @@ from pathlib import Path
 from eitbench.cli.app import app
 from typer.testing import CliRunner
 
-for words, said in json.loads(Path("commands.json").read_text()):
+for words, expected in json.loads(Path("commands.json").read_text()):
     words = [words] if isinstance(words, str) else words
     done = CliRunner().invoke(app, words)
-    assert done.exit_code == 0 and said in done.output, (words, done.output, done.exception)
+    assert done.exit_code == 0 and expected in done.output, (words, done.output, done.exception)
 """
-"""Runs them one after another: what each process would import and compile is there after the first."""
+"""Script that runs all commands in one process, which imports and compiles once."""
 
 
 @pytest.fixture(scope="module")
 def empty(installed):
-    """A folder without a checkout, and only what these tests leave in it."""
+    """Return a folder outside the checkout, with files of these tests only."""
     folder = installed.folder / "empty"
     folder.mkdir()
     (folder / "tiny.yml").write_text(TINY)
@@ -72,7 +72,7 @@ def empty(installed):
 
 
 def test_the_wheel_is_small_and_whole(installed):
-    """Agents' models, animations, records and the rendered site are in a checkout only."""
+    """Agents' models, animations, records and the rendered site are not part of the package."""
     (wheel,) = (installed.folder / "wheels").glob("eitbench-*.whl")
     assert wheel.stat().st_size < 5e6
     names = set(zipfile.ZipFile(wheel).namelist())
@@ -84,7 +84,7 @@ def test_the_wheel_is_small_and_whole(installed):
 
 
 def test_every_command_works_in_an_empty_folder(installed, empty):
-    """In the order of a first hour: what one has written the next one reads."""
+    """Commands run in the order of a first session: each uses files of earlier ones."""
     assert {words if isinstance(words, str) else words[0] for words, _ in COMMANDS} == {
         name for name, command in get_command(app).commands.items() if not command.hidden}
     (empty / "commands.json").write_text(json.dumps(COMMANDS))
@@ -92,7 +92,7 @@ def test_every_command_works_in_an_empty_folder(installed, empty):
 
 
 def test_what_the_readme_shows_works(installed, empty):
-    """Its Python, from the first block to the last, and the records as a table; the agent learns once only."""
+    """All Python blocks run, with a short training of the agent, and the records load as a table."""
     readme = (ROOT / "README.md").read_text()
     shown = "\n".join(re.findall(r"```python\n(.*?)```", readme, re.DOTALL))
     assert "learn(100_000)" in shown
@@ -102,7 +102,7 @@ def test_what_the_readme_shows_works(installed, empty):
 
 
 def test_an_agent_s_record_asks_for_its_model(installed, empty, tmp_path):
-    """By name it cannot be played, and that is said; a copy of its model is known as ours, wherever it lies."""
+    """An error names an agent that is not part of the package; a copy of its model is identified as built-in."""
     said = installed("-m", "eitbench.cli", "verify", AGENT, "--episodes", "1", cwd=empty, code=1)
     assert "models of our trained agents are in a checkout only" in said
     record = read_record(RESULTS / AGENT)

@@ -207,7 +207,7 @@ def located(measurements, **options):
 
 
 def test_lost_measurements_are_left_out_one_by_one(measurements):
-    """With 5 % lost all channels are used, and the inclusion is found within 5 mm of the complete data's."""
+    """If 5 % are lost all channels are used, and the inclusion is within 5 mm of the complete data's."""
     _, complete, position = located(measurements)
     lost = np.random.default_rng(0).random(measurements.voltages.shape) < 0.05
     env, run, found = located(replace(measurements, voltages=np.where(lost, np.nan, measurements.voltages)))
@@ -237,7 +237,7 @@ def test_a_frame_is_not_scored_by_itself():
     """Without a homogeneous frame nothing is scored; an absolute image shows the inclusion."""
     single = replace(stationary(), reference=None)
     env = MeasuredEnv(single, VESSEL, initial_std=0.2)
-    assert "no homogeneous frame" in env.quality_warnings()[0]
+    assert "homogeneous frame is missing" in env.quality_warnings()[0]
     assert np.isnan(run_on_measurements(env, "gauss_newton").withheld_rmse)
     env = MeasuredEnv(single, VESSEL, initial_std=0.2, correction="none")
     run = run_on_measurements(env, "gauss_newton")

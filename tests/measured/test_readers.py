@@ -170,7 +170,7 @@ def described_table(path, titles="", readings=None, first="{:d}"):
     ("", "{:d}.0"), ("", "{:d}.000e+00"), ("source,sink," + ",".join(f"ch-{k}" for k in range(1, 9)), "{:d}"),
     ("I+,I-," + ",".join(f"U{k}" for k in range(1, 9)), "{:d}")])
 def test_tables_of_potentials(tmp_path, titles, first):
-    """Numbers with a decimal point are no titles, and a "-" in a title is no difference."""
+    """Numbers with a decimal point are not titles, and a "-" in a title is not a difference."""
     plain = described_table(tmp_path / "plain.csv")
     other = described_table(tmp_path / "other.csv", titles, first=first)
     np.testing.assert_array_equal(other.voltages, plain.voltages)
@@ -179,7 +179,7 @@ def test_tables_of_potentials(tmp_path, titles, first):
 
 
 def test_tables_of_differences(tmp_path):
-    """Titles that name two electrodes, or the description, tell that the voltages are differences."""
+    """Voltages are differences if titles name two electrodes, or by the description."""
     titles = "a,b," + ",".join(f"U{k + 1}-U{(k + 1) % 8 + 1}" for k in range(8))
     for each in (described_table(tmp_path / "a.csv", titles),
                  described_table(tmp_path / "b.csv", readings="neighbours")):
@@ -195,7 +195,7 @@ def test_file_of_a_vessel_does_not_describe_a_table(tmp_path):
     (tmp_path / "tank.yml").write_text("kind: circle\nradius: 0.1\n")
     assert read(tmp_path / "tank.csv").voltages.shape == (2, 8)
     (tmp_path / "tank.csv.yml").unlink()
-    with pytest.raises(ValueError, match=r"no tank\.csv\.yml"):
+    with pytest.raises(ValueError, match=r"neither tank\.csv\.yml"):
         read(tmp_path / "tank.csv")
 
 

@@ -1,6 +1,6 @@
 """Sparse systems condensed onto their last unknowns, against dense inverses.
 
-What holds for the compiled kernels holds for the tests' own reference too.
+The tests also run on the reference implementation in tests/references.py.
 """
 
 import pickle
@@ -20,7 +20,7 @@ both = pytest.mark.parametrize("kind", [Condensation, SuperLUCondensation])
 
 
 def random_pattern(n: int, n_ports: int, seed: int) -> sp.csc_array:
-    """A connected symmetric pattern: a grid with random long edges, and ports that touch much."""
+    """Return a connected symmetric pattern: a grid with random long edges, and ports with many neighbours."""
     rng = np.random.default_rng(seed)
     side = int(np.ceil(np.sqrt(n - n_ports)))
     i = np.arange(n - n_ports)
@@ -37,7 +37,7 @@ def random_pattern(n: int, n_ports: int, seed: int) -> sp.csc_array:
 
 
 def random_matrices(pattern: sp.csc_array, count: int, seed: int) -> list[np.ndarray]:
-    """Dense symmetric positive definite matrices of this pattern, diagonally dominant by little."""
+    """Return dense symmetric positive definite matrices of this pattern, weakly diagonally dominant."""
     rng = np.random.default_rng(seed)
     matrices = []
     for _ in range(count):
@@ -69,7 +69,7 @@ def test_dense_inverse(kind, n, n_ports):
 
 
 def box_pattern(shape, n_ports):
-    """A 3D grid with 27-point stencils and its places; the ports, which are last, touch its end."""
+    """Return a 3D grid with 27-point stencils and its coordinates; the ports, which are last, touch its end."""
     grid = np.meshgrid(*map(np.arange, shape), indexing="ij")
     places = np.stack(grid, axis=-1).reshape(-1, 3).astype(float)
     n = len(places)
@@ -119,7 +119,7 @@ def test_entries_are_complete(kind):
 
 
 def test_a_state_keeps_its_bits_wherever_it_stands_in_a_batch():
-    """Lanes do not speak to each other, and a batch of any length gives the same numbers."""
+    """Lanes are independent, and a batch of any length gives the same numbers."""
     pattern = random_pattern(200, 6, seed=4)
     system = Condensation(pattern, 6)
     values = np.stack([K[system.rows, system.columns]
@@ -132,7 +132,7 @@ def test_a_state_keeps_its_bits_wherever_it_stands_in_a_batch():
 
 
 def test_systems_and_threads_do_not_disturb_each_other():
-    """Working memory is shared by all systems of a thread, and by no other thread."""
+    """Working memory is shared by all systems of a thread, but not between threads."""
     systems = []
     values = []
     alone = []
@@ -161,7 +161,7 @@ def test_pickled():
 
 
 def test_numba_that_does_not_work_is_named(monkeypatch):
-    """With an unsupported numpy, for example, one sentence names the problem and the remedy."""
+    """An error, for example of an unsupported numpy, names the problem and the remedy in one sentence."""
     system = Condensation(random_pattern(30, 2, seed=0), 2)
     monkeypatch.setitem(sys.modules, "eitbench.numerics.kernels", None)
     monkeypatch.delattr("eitbench.numerics.kernels", raising=False)

@@ -1,4 +1,4 @@
-"""Meshes: what they count and measure, how they interpolate, and what they refuse."""
+"""Meshes: counts and measures, interpolation, and invalid arguments."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ in_both_dimensions = pytest.mark.parametrize("dim", [2, 3])
 
 
 def facet_sizes(mesh: Mesh) -> np.ndarray:
-    """Length (2D) or area (3D) of each boundary facet."""
+    """Return the length (2D) or area (3D) of each boundary facet."""
     corner = mesh.points[mesh.boundary_facets]
     edge = corner[:, 1:] - corner[:, :1]
     if mesh.dim == 2:
@@ -33,7 +33,7 @@ def facet_sizes(mesh: Mesh) -> np.ndarray:
 
 @in_both_dimensions
 def test_volumes(dim):
-    """The cells fill the box; each has the volume its mass matrix gives it."""
+    """The cells fill the box; volumes agree with the mass matrix."""
     mesh = MESHES[dim]
     assert mesh.dim == dim and mesh.volumes.shape == (len(mesh.cells),) and (mesh.volumes > 0).all()
     assert_allclose(mesh.volumes.sum(), SIZE[:dim].prod(), rtol=1e-13)
@@ -58,7 +58,7 @@ def test_boundary_facets(dim):
 
 @in_both_dimensions
 def test_facets_where(dim):
-    """A side is found by its coordinate, with its whole size; a point on the boundary holds no facet."""
+    """A side is found by its coordinate, with its full size; a point on the boundary has no facet."""
     mesh = MESHES[dim]
     top = mesh.facets_where(lambda p: p[:, dim - 1] > SIZE[dim - 1] - 1e-9)
     assert len(top) == (6 if dim == 2 else 2 * 3 * 4)
@@ -68,7 +68,7 @@ def test_facets_where(dim):
 
 @in_both_dimensions
 def test_orientation_does_not_matter(dim):
-    """Nodes of a cell in any order: same volumes, boundary, interpolation and stiffness."""
+    """Volumes, boundary, interpolation and stiffness do not depend on the order of a cell's nodes."""
     mesh = MESHES[dim]
     rng = np.random.default_rng(0)
     turned = Mesh(mesh.points, rng.permuted(mesh.cells, axis=1))
@@ -95,7 +95,7 @@ def test_stiffness_of_a_linear_function(dim):
 @given(dim=st.sampled_from([2, 3]), seed=st.integers(0, 2**32 - 1), candidates=st.sampled_from([1, 4, 32]),
        a=st.lists(st.floats(-100, 100), min_size=4, max_size=4))
 def test_interpolation_is_exact_for_linear_functions(dim, seed, candidates, a):
-    """a₀ + a·x is reproduced to rounding at any points inside, however few cells are tried first; rows sum to one."""
+    """a₀ + a·x is reproduced to rounding at any points inside, for any number of candidates; rows sum to one."""
     mesh = MESHES[dim]
     points = np.random.default_rng(seed).uniform(size=(20, dim)) * SIZE[:dim]
     matrix = mesh.interpolation_to(points, candidates)
@@ -107,7 +107,7 @@ def test_interpolation_is_exact_for_linear_functions(dim, seed, candidates, a):
 
 @in_both_dimensions
 def test_points_just_outside_take_the_value_at_the_wall(dim):
-    """Outside by a millionth, as after rounding, a convex combination of the wall's nodes is taken."""
+    """At a point outside by a millionth, as by rounding, values are a convex combination of the wall's nodes."""
     mesh = MESHES[dim]
     wall = mesh.points[mesh.boundary_facets].mean(axis=1)
     outside = wall + 1e-6 * (wall - SIZE[:dim] / 2)
@@ -118,7 +118,7 @@ def test_points_just_outside_take_the_value_at_the_wall(dim):
 
 
 def test_points_behind_a_polygonal_wall_take_the_value_at_the_wall():
-    """On a disc's true circle the value is taken no further away than the polygon's sagitta, thin cells or not."""
+    """On a disc's circle the value is from a distance of at most the polygon's sagitta, also with thin cells."""
     spans = np.array([[0.2, 1.0], [2.2, 3.4], [4.5, 5.0]])
     mesh, _ = disc_mesh(0.1, spans, 6, grading=2.5)
     angle = np.linspace(0.0, 2 * np.pi, 500)
@@ -238,7 +238,7 @@ def test_graded_pipe_mesh():
     assert_allclose(y, graded(-0.05, 0.05, 8, 1.5), atol=1e-15)
 
 
-# -- what is refused --------------------------------------------------------------------------------------------------
+# -- errors -----------------------------------------------------------------------------------------------------------
 
 @pytest.mark.parametrize(("points", "cells", "match"), [
     (TRIANGLE[:, :1], [[0, 1]], r"points must have shape \(n_nodes, 2\) or \(n_nodes, 3\)"),

@@ -1,4 +1,4 @@
-"""Meshes and groups of facets from files: round trips, files as gmsh writes them, and refusals."""
+"""Meshes and groups of facets from files: round trips, files written by gmsh, and errors."""
 
 import hashlib
 import re
@@ -22,7 +22,7 @@ in_both_dimensions = pytest.mark.parametrize("dim", [2, 3])
 
 
 def groups_of(mesh: Mesh) -> dict[str, np.ndarray]:
-    """Both ends, the rest of the boundary, and all of it once more."""
+    """Return groups: both ends, the rest of the boundary, and the full boundary."""
     left, right = end_facets(mesh)
     ends = {tuple(facet) for facet in np.concatenate([left, right]).tolist()}
     rest = [facet for facet in mesh.boundary_facets.tolist() if tuple(facet) not in ends]
@@ -35,7 +35,7 @@ def groups_of(mesh: Mesh) -> dict[str, np.ndarray]:
 
 @in_both_dimensions
 def test_round_trip(dim, tmp_path):
-    """Nodes to the bit, cells and groups are those that were written, in whatever order. Of a drawing in millimetres
+    """Nodes (bit-identical), cells and groups equal the written ones, in any order. For a drawing in millimetres
     lengths are divided by a thousand."""
     mesh = MESHES[dim]
     groups = groups_of(mesh)
@@ -73,7 +73,7 @@ def test_other_formats(dim, format, ending, binary, tmp_path):
 
 @pytest.mark.parametrize("turn", [str.lower, str.upper])
 def test_the_right_file_is_read(turn, tmp_path):
-    """A SHA-256 in either case; of another file it names both."""
+    """A SHA-256 is accepted in upper and lower case; an error for another file contains both."""
     write_mesh(tmp_path / "box.msh", MESHES[2])
     sha256 = hashlib.sha256((tmp_path / "box.msh").read_bytes()).hexdigest()
     assert read_mesh(tmp_path / "box.msh", turn(sha256)).mesh.n_nodes == MESHES[2].n_nodes
@@ -198,7 +198,7 @@ def test_a_cell_of_two_groups_is_one_cell(tmp_path):
     assert len(groups["walls"]) == 2
 
 
-# -- what is refused ------------------------------------------------------------------------------
+# -- errors --------------------------------------------------------------------------------------
 
 TRIANGLES = "6 2 2 3 1 20 30 40\n7 2 2 3 1 20 40 50\n"
 
@@ -240,12 +240,12 @@ def test_files_that_are_refused(text, match, tmp_path, capsys):
 
 @pytest.mark.parametrize("name", ["pipe.msh", "pipe.vtu", "", "pipe.xyzzy"])
 def test_files_that_are_not_there(name, tmp_path):
-    """Nor is a folder a file, and an ending that meshio does not know is named."""
+    """A folder and an unknown suffix are rejected with the name."""
     with pytest.raises(ValueError, match="file not found"):
         read_mesh(tmp_path / name)
     if name:
         (tmp_path / name).write_text("nonsense")
-        with pytest.raises(ValueError, match=rf"{name}: must be a whole mesh file in a format"):
+        with pytest.raises(ValueError, match=rf"{name}: must be a complete mesh file in a format"):
             read_mesh(tmp_path / name)
 
 
@@ -256,7 +256,7 @@ def test_scales_that_are_refused(scale, tmp_path):
 
 
 def test_without_meshio_the_extra_is_named(tmp_path, monkeypatch):
-    """Our own worlds are built without it."""
+    """Built-in worlds do not need meshio."""
     path = tmp_path / "it.msh"
     path.write_text(SQUARE)
     monkeypatch.setitem(sys.modules, "meshio", None)

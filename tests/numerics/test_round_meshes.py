@@ -1,4 +1,4 @@
-"""Round sections and extruded bodies: what they count and measure, how their cells meet, and what they refuse."""
+"""Round sections and extruded bodies: counts, measures, conformity, and invalid arguments."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ Z = np.array([-0.1, 0.0, 0.02, 0.1, 0.25])
 
 
 def random_rings(rng: np.random.Generator) -> tuple[np.ndarray, list[np.ndarray]]:
-    """Five rings of 5 to 30 nodes, none where a regular polygon has them, that begin anywhere."""
+    """Return five rings of 5 to 30 nodes at irregular angles."""
     counts = np.sort(rng.integers(5, 31, 5))
     rings = [2 * np.pi * (np.arange(n) + rng.uniform(-0.2, 0.2, n)) / n + rng.uniform(-10.0, 10.0) for n in counts]
     return R * np.array([0.1, 0.3, 0.5, 0.7, 1.0]), rings
 
 
 def facet_counts(mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:
-    """Every facet of every cell once, and how many cells it belongs to."""
+    """Return every facet of every cell once, and its number of cells."""
     facets = np.concatenate([np.delete(mesh.cells, i, axis=1) for i in range(mesh.dim + 1)])
     return np.unique(np.sort(facets, axis=1), axis=0, return_counts=True)
 
@@ -38,7 +38,7 @@ def polygon_area(points: np.ndarray) -> float:
 
 
 def angles_of(mesh: Mesh) -> np.ndarray:
-    """(n_cells, 3) angles of the triangles in degrees."""
+    """Return (n_cells, 3) angles of the triangles in degrees."""
     corner = mesh.points[mesh.cells]
     ahead, back = np.roll(corner, -1, axis=1) - corner, np.roll(corner, 1, axis=1) - corner
     cosine = (ahead * back).sum(axis=2) / (np.linalg.norm(ahead, axis=2) * np.linalg.norm(back, axis=2))
@@ -69,7 +69,7 @@ def test_rings_are_joined_without_gap_or_overlap(seed):
 
 
 def test_nodes_are_numbered_from_the_centre_outwards():
-    """Node 0 is the centre, then come the rings in the order of their angles."""
+    """Node 0 is the centre, followed by the rings in the order of their angles."""
     radii, rings = random_rings(np.random.default_rng(1))
     points = disc_mesh(radii, rings).points
     assert_array_equal(points[0], 0.0)
@@ -91,7 +91,7 @@ def test_uniform_disc(rings):
 @pytest.mark.parametrize(("spans", "cells", "rings", "smallest"), [
     (SPANS, 3, 6, 18), (SPANS, 8, 10, 18), (UNEVEN, 6, 8, 11), (SPANS, 1, 3, 25)])
 def test_electrode_disc(spans, cells, rings, smallest):
-    """Electrode edges are nodes; electrodes and gaps have equally many cells, crowded at the edges; none is thin."""
+    """Electrode edges are nodes; electrodes and gaps have equal numbers of cells, denser at the edges and not thin."""
     mesh = electrode_disc(R, spans, cells, rings)
     wall = np.unique(mesh.boundary_facets)
     assert len(wall) == 2 * len(spans) * cells
@@ -111,7 +111,7 @@ def test_electrode_disc(spans, cells, rings, smallest):
 
 @each_section
 def test_nodes_are_numbered_by_section(section):
-    """The nodes of every z are the section's, in its order; a cell's nodes lie in two neighbouring sections."""
+    """The nodes at every z are the section's, in its order; a cell's nodes are in two neighbouring sections."""
     body = extrude(section, Z)
     points = body.points.reshape(len(Z), section.n_nodes, 3)
     assert_array_equal(points[:, :, :2], np.broadcast_to(section.points, (len(Z), *section.points.shape)))
@@ -161,7 +161,7 @@ def test_round_pipe_mesh():
     z = np.unique(mesh.points[:, 2])
     assert len(z) == 1 + 2 + 4 + 4 + 4 + 2
     assert_allclose(z[[0, 2, 6, 10, 14, 16]], [0.0, 0.03, 0.07, 0.13, 0.17, 0.2], atol=1e-15)
-    assert np.diff(z)[2] < 0.5 * np.diff(z)[3]                                         # crowded at the edge
+    assert np.diff(z)[2] < 0.5 * np.diff(z)[3]                                         # denser at the edge
     angle = np.mod(np.arctan2(mesh.points[:, 1], mesh.points[:, 0]) - SPANS[2, 0] + 1e-9, 2 * np.pi)
     wall = np.abs(np.hypot(*mesh.points.T[:2]) - R) < 1e-12
     on_electrode = wall & (angle < np.pi / 8 + 2e-9) & (np.abs(mesh.points[:, 2] - 0.15) < 0.02 + 1e-12)
@@ -172,7 +172,7 @@ def test_round_pipe_mesh():
     assert_allclose(area.sum(), 0.04 * chords.sum(), rtol=1e-10)
 
 
-# -- what is refused --------------------------------------------------------------------------------------------------
+# -- errors -----------------------------------------------------------------------------------------------------------
 
 SQUARE = np.pi / 2 * np.arange(4)
 
@@ -207,6 +207,6 @@ SQUARE = np.pi / 2 * np.arange(4)
     (lambda: round_pipe_mesh(0.4, R, SPANS, np.zeros((0, 2)), (2, 2), 3), "spans_along must"),
     (lambda: round_pipe_mesh(0.4, R, SPANS, np.array([[0.03, 0.07]]), (2, 0), 3), "cells_at_electrodes.*an integer")])
 def test_wrong_arguments_are_refused(call, match):
-    """Whatever is out of order is named, before a mesh is made of it."""
+    """Invalid arguments are named before a mesh is built."""
     with pytest.raises(ValueError, match=re.compile(match, re.DOTALL)):
         call()

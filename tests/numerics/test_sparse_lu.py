@@ -1,6 +1,6 @@
-"""Sparse LU factors against dense solutions; a column never feels its neighbours.
+"""Sparse LU factors against dense solutions; columns are independent.
 
-What holds for the compiled substitution holds for the tests' own reference too.
+The tests also run on the reference implementation in tests/references.py.
 """
 
 import numpy as np
@@ -16,7 +16,7 @@ WIDTHS = (1, 7, 8, 9, 20)
 
 
 def random_matrix(n, seed):
-    """Symmetric pattern, unsymmetric values of both signs, a diagonal that dominates by little.
+    """Return a matrix with symmetric pattern, unsymmetric values of both signs, and weak diagonal dominance.
 
     The unknowns are numbered at random.
     """
@@ -51,7 +51,7 @@ def test_dense_solution(kind, n, k):
 @both
 @pytest.mark.parametrize("layout", ["Fortran", "slice", "transposed", "integers"])
 def test_any_memory_layout(kind, layout):
-    """Right-hand sides may lie in memory as they like."""
+    """Right-hand sides may have any memory layout."""
     solver = kind(sp.csr_array(random_matrix(60, seed=2)))
     right = np.random.default_rng(1).normal(size=(60, 9))
     given = {"Fortran": np.asfortranarray(right),

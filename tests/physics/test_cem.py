@@ -33,7 +33,7 @@ IMPEDANCE = np.array([0.3, 0.1, 0.2, 0.05])
 
 @cache
 def small(dim: int) -> tuple[Mesh, list[np.ndarray], np.ndarray]:
-    """Mesh, four electrodes (one fills a side, the others a part of one) and a random conductivity."""
+    """Return mesh, four electrodes (one covers a side, the others parts of a side) and a random conductivity."""
     rng = np.random.default_rng(dim)
     if dim == 2:
         mesh = shaken_rectangle(1.0, 0.6, (5, 4), rng)
@@ -55,7 +55,7 @@ def small_cem(dim: int, order: int) -> CompleteElectrodeModel:
 
 
 def patterns(n_electrodes: int, n_random: int = 2) -> np.ndarray:
-    """All pairs with the first electrode, then random currents."""
+    """Return all pairs with the first electrode, then random currents."""
     pairs = np.eye(n_electrodes)[:1] - np.eye(n_electrodes)[1:]
     random = np.random.default_rng(7).standard_normal((n_random, n_electrodes))
     return np.concatenate([pairs, random - random.mean(axis=1, keepdims=True)])
@@ -78,7 +78,7 @@ def test_dense_reference(dim, order):
 
 @every_element
 def test_other_contacts_are_solved_with(dim, order):
-    """The dense solution with these impedances; the model that they were changed of stays what it was."""
+    """Voltages equal the dense solution with these impedances; the original model is unchanged."""
     mesh, electrodes, sigma = small(dim)
     currents = patterns(4)
     cem = small_cem(dim, order)
@@ -111,7 +111,7 @@ def test_scipy_agrees(dim, order):
 
 @every_element
 def test_power_balance(dim, order):
-    """The power put in is lost in the volume and in the contacts: I·U = ∫σ|∇u|² + Σ z∫j²; each part is positive."""
+    """The power equals the losses in the volume and in the contacts: I·U = ∫σ|∇u|² + Σ z∫j²; all are positive."""
     mesh, electrodes, sigma = small(dim)
     currents = patterns(4)
     dense = dense_solution(mesh, electrodes, IMPEDANCE, order, sigma, currents)
@@ -128,7 +128,7 @@ def test_power_balance(dim, order):
 
 @every_element
 def test_full_end_electrodes(dim, order):
-    """A uniform rectangle or box between two full-end electrodes: ΔU = I [L/(σA) + (z₁ + z₂)/A]; u is linear."""
+    """A uniform rectangle or box between two full-end electrodes has ΔU = I [L/(σA) + (z₁ + z₂)/A]; u is linear."""
     mesh = small(dim)[0]
     area = 0.6 if dim == 2 else 0.8 * 0.6
     z = (0.02, 0.5)
@@ -138,7 +138,7 @@ def test_full_end_electrodes(dim, order):
 
 
 def test_uneven_slab():
-    """σ linear along a slab, all of it one current tube: R → ln(σ₁/σ₀)/(σ₁ − σ₀) + 2z, at order 4 with P2."""
+    """For σ linear along a slab, R → ln(σ₁/σ₀)/(σ₁ − σ₀) + 2z, at order 4 with P2."""
     errors = []
     for cells in (4, 8, 16):
         mesh = shaken_rectangle(1.0, 1.0, (cells, 2), np.random.default_rng(0))
@@ -151,7 +151,7 @@ def test_uneven_slab():
 
 @pytest.mark.parametrize(("order", "final"), [(1, 2e-4), (2, 4e-5)])
 def test_annulus(order, final):
-    """Current along the radii of an annulus: the closed form is approached like h² (circles are polygons here)."""
+    """For a radial current in an annulus, R approaches the closed form like h² (circles are polygons here)."""
     a, b, sigma, z = 0.03, 0.1, 0.4, (2e-2, 5e-2)
     errors = []
     for n in (32, 64):
@@ -172,7 +172,7 @@ CONTACTS = 5e-3 * np.array([1.0, 2.0, 3.0, 1.5, 0.5])
 
 
 def inclusion(r: np.ndarray) -> np.ndarray:
-    """A concentric inclusion three times as conductive, with a soft rim, gone to rounding at the wall."""
+    """Return a concentric inclusion with three times the conductivity and a smooth rim, uniform at the wall."""
     return SALINE * (1.0 + 2.0 * np.exp(-(r / (0.4 * RADIUS))**4))
 
 
@@ -183,7 +183,7 @@ def disc_reference(homogeneous: bool) -> np.ndarray:
 
 
 def test_disc_reference_is_converged():
-    """The semi-analytic 𝓡 has settled to 1e-6 in its polynomial degree and number of Fourier modes."""
+    """The semi-analytic 𝓡 has converged to 1e-6 in polynomial degree and number of Fourier modes."""
     rough = disc_resistance(RADIUS, SPANS, CONTACTS, disc_modes(inclusion, RADIUS, 20), SALINE, 16, 10_000)
     reference = disc_reference(homogeneous=False)
     assert np.linalg.norm(rough - reference) < 3e-6 * np.linalg.norm(reference)
@@ -191,7 +191,7 @@ def test_disc_reference_is_converged():
 
 
 def test_disc():
-    """𝓡 of five unequal electrodes on a disc, homogeneous and with an inclusion, is approached like h²."""
+    """𝓡 of five unequal electrodes on a disc, homogeneous and with an inclusion, converges like h²."""
     errors, results = [], []
     references = np.stack([disc_reference(True), disc_reference(False)])
     size = np.linalg.norm(references, axis=(1, 2))
@@ -213,7 +213,7 @@ def test_disc():
 
 @every_element
 def test_reciprocity(dim, order):
-    """I₁·U(I₂) = I₂·U(I₁), already in scipy's grounded solution, which is not symmetrised."""
+    """Reciprocity I₁·U(I₂) = I₂·U(I₁) holds, also in scipy's grounded solution, which is not symmetrised."""
     mesh, electrodes, sigma = small(dim)
     cem = reference_model(mesh, electrodes, IMPEDANCE, order)
     currents = patterns(4)
@@ -256,7 +256,7 @@ def test_jacobian(dim, order):
 # -- the pipe's meshes ------------------------------------------------------------------------------------------------
 
 def slugs(points: np.ndarray) -> np.ndarray:
-    """Two slugs of opposite sign on a wave along the pipe, S/m."""
+    """Return two slugs of opposite sign on a wave along the pipe, S/m."""
     x, y = points.T
     blob = np.exp(-((x - 0.11) / 0.03)**2 - ((y - 0.015) / 0.02)**2)
     hole = np.exp(-((x - 0.27) / 0.04)**2 - ((y + 0.02) / 0.02)**2)
@@ -283,7 +283,7 @@ def test_pipe_meshes_are_fine_enough():
     assert rms["P1"] > 1.0, rms
 
 
-# -- what is refused --------------------------------------------------------------------------------------------------
+# -- errors ------------------------------------------------------------------------------------------------------------
 
 def test_model_refuses_wrong_electrodes_and_contacts():
     """Every argument of the constructor is checked, and the message names it."""
@@ -307,7 +307,7 @@ def test_model_refuses_wrong_electrodes_and_contacts():
 
 
 def test_solver_refuses_wrong_conductivity_and_currents():
-    """A conductivity must be finite, positive and one number a node; currents must be (K, L) and sum to zero."""
+    """A conductivity must be finite, positive and one number per node; currents must be (K, L) and sum to zero."""
     cem, sigma = small_cem(2, 2), small(2)[2]
     currents = patterns(4)
     for bad in (np.where(np.arange(len(sigma)) == 5, np.nan, sigma), -sigma, 0.0 * sigma, sigma[:-1]):

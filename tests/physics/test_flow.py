@@ -1,5 +1,4 @@
-"""Velocity fields: without divergence, at rest on the walls, of the mean they are asked for; and a family of profiles
-that adds up as it says."""
+"""Velocity fields: divergence, no slip on the walls, mean velocity; and parametrised profiles."""
 
 import math
 
@@ -14,12 +13,12 @@ from eitbench.worlds.catalogue import PIPE_2D_SKEWED
 R = 0.05
 MODEL = VelocityModel(R, ((1.5, 0.0, -1.5), (0.0, 2.0), (0.5, 0.25, 0.0, -0.75)), (4.0, 0.0, 1.0), (1.0, 2.0, 3.0),
                       (0.1, 0.0, 0.3))
-"""Three profiles of different degrees; the second slips on the walls."""
+"""Return three profiles of different degrees; the second slips on the walls."""
 POINTS = np.random.default_rng(0).uniform([0.0, -R], [0.4, R], (200, 2))
 
 
 def skewed_mean(k):
-    """½ ∫ (1 − η²)·exp(kη) dη over [−1, 1], by parts."""
+    """Return ½ ∫ (1 − η²)·exp(kη) dη over [−1, 1], by parts."""
     return 2.0 * (k * math.cosh(k) - math.sinh(k)) / k**3
 
 
@@ -29,7 +28,7 @@ def skewed_mean(k):
 @pytest.mark.parametrize("flow", [PlaneChannelFlow(4.5, R), *(SkewedChannelFlow(4.5, R, k) for k in (
     -5.0, -0.6, 0.0, 0.3, 2.5, 5.0))], ids=str)
 def test_mean_over_a_section_is_the_mean_velocity(flow):
-    """(1/2R) ∫ v dy = v̄ to rounding, by a rule of more points than the flow's own."""
+    """(1/2R) ∫ v dy = v̄ to rounding, by a quadrature of more points than in the flow."""
     eta, weights = np.polynomial.legendre.leggauss(60)
     velocity = flow(np.column_stack([np.full(60, 0.13), R * eta]))
     assert 0.5 * weights @ velocity[:, 0] == pytest.approx(4.5, rel=1e-13)
@@ -38,7 +37,7 @@ def test_mean_over_a_section_is_the_mean_velocity(flow):
 @pytest.mark.parametrize("flow", [PlaneChannelFlow(4.5, R), PowerLawFlow(4.5, R), SkewedChannelFlow(4.5, R, 0.8),
                                   MODEL.field((4.0, -1.0, 2.0))], ids=lambda flow: type(flow).__name__)
 def test_flow_has_no_divergence(flow):
-    """Axial and the same in every section: ∂v₁/∂x = 0 and v₂ = 0, to the bit."""
+    """The flow is axial and equal in every section: ∂v₁/∂x = 0 and v₂ = 0, bit-identical."""
     velocity = flow(POINTS)
     np.testing.assert_array_equal(velocity[:, 1], 0.0)
     np.testing.assert_array_equal(flow(POINTS + np.array([0.1, 0.0])), velocity)
@@ -53,7 +52,7 @@ def test_fluid_rests_at_the_walls_and_is_fastest_on_the_axis():
 
 @pytest.mark.parametrize("exponent", [1 / 7, 1 / 3, 1.0, 2.0])
 def test_power_law_has_the_mean_it_is_asked_for(exponent):
-    """(1/R) ∫₀ᴿ v dy = v̄ on either side, with t = (1 − y/R)^(1/7) as the variable, in which v is smooth."""
+    """(1/R) ∫₀ᴿ v dy = v̄ on both sides, with the variable t = (1 − y/R)^(1/7), in which v is smooth."""
     t, weights = np.polynomial.legendre.leggauss(40)
     t, weights = 0.5 * (t + 1.0), 0.5 * weights
     for side in (-R, R):
@@ -69,13 +68,13 @@ def test_power_law_is_flatter_than_laminar_flow():
 
 
 def test_plug_flow_is_the_same_everywhere():
-    """v̄ along x at any point, the wall's included, in 2D and in 3D."""
+    """The velocity is v̄ along x at any point, also on the wall, in 2D and in 3D."""
     np.testing.assert_array_equal(PlugFlow(3.0)(np.array([[0.1, -0.05], [2.0, 0.0]])), [[3.0, 0.0], [3.0, 0.0]])
     np.testing.assert_array_equal(PlugFlow(3.0)(np.zeros((1, 3))), [[3.0, 0.0, 0.0]])
 
 
 def test_round_pipe_carries_its_mean_velocity():
-    """(1/πR²) ∫ v dA = v̄: Gauss–Legendre in r² is exact for the paraboloid; by finite elements it is reached like h².
+    """(1/πR²) ∫ v dA = v̄: Gauss–Legendre in r² is exact for the paraboloid; finite elements converge like h².
 
     The nodal values on a polygon give 1 − O(h²): the difference falls by four when the rings are doubled.
     """
@@ -135,7 +134,7 @@ def test_integer_points_are_taken_as_numbers(flow, point, velocity):
 
 
 def test_quadrature_is_exact():
-    """∫ y^d dy over the section for every degree that 24 points can do, and so ∫φ_k φ_l."""
+    """∫ y^d dy over the section is exact for every degree of 24 points, and so is ∫φ_k φ_l."""
     for degree in range(48):
         exact = 2.0 * R**(degree + 1) / (degree + 1) if degree % 2 == 0 else 0.0
         assert MODEL.weights @ MODEL.points**degree == pytest.approx(exact, rel=1e-13, abs=1e-13 * R**(degree + 1))
@@ -144,7 +143,7 @@ def test_quadrature_is_exact():
 
 
 def test_profiles_are_those_of_the_directions():
-    """φ_k at `points` is the axial velocity of the k-th basis field there; here written out by hand."""
+    """φ_k at `points` is the axial velocity of the k-th basis field, here computed by hand."""
     eta = MODEL.points / R
     by_hand = np.stack([1.5 - 1.5 * eta**2, 2.0 * eta, 0.5 + 0.25 * eta - 0.75 * eta**3], axis=1)
     np.testing.assert_allclose(MODEL.profiles, by_hand, rtol=1e-12, atol=1e-15)
@@ -155,14 +154,14 @@ def test_profiles_are_those_of_the_directions():
 
 
 def test_field_is_the_sum_of_its_directions():
-    """v = Σ θ_k φ_k anywhere in the channel, whatever the degrees of the φ_k."""
+    """v = Σ θ_k φ_k anywhere in the channel, for any degrees of the φ_k."""
     theta = np.array([4.0, -1.5, 0.7])
     total = sum(value * direction(POINTS) for value, direction in zip(theta, MODEL.basis_fields, strict=True))
     np.testing.assert_allclose(MODEL.field(theta)(POINTS), total, rtol=1e-12, atol=1e-14)
 
 
 def test_parabola_is_the_plane_channel_flow_of_its_mean():
-    """Its one parameter is the mean velocity."""
+    """The only parameter is the mean velocity."""
     model = parabolic_model(R, 4.5, 1.0, 0.02)
     np.testing.assert_allclose(model.field([3.7])(POINTS), PlaneChannelFlow(3.7, R)(POINTS), rtol=1e-12)
     assert (model.nominal, model.initial_std, model.walk_std) == ((4.5,), (1.0,), (0.02,))
@@ -170,9 +169,9 @@ def test_parabola_is_the_plane_channel_flow_of_its_mean():
 
 @pytest.mark.parametrize("k", [-1.0, 0.6, 1.0])
 def test_basis_of_the_skewed_pipe_holds_its_truth_well_but_not_exactly(k):
-    """The best combination of the three profiles errs by 0.2 to 2 % of the flow; by the parabola alone by 15 to 50 %.
+    """The best fit by three profiles has an error of 0.2 to 2 % of the flow; by the parabola alone of 15 to 50 %.
 
-    No inverse crime, and yet the model is good enough to be worth estimating; of the mean velocity it tells within 1 %.
+    The model is not exact, to avoid an inverse crime; its mean velocity is accurate to 1 %.
     """
     low, high = PIPE_2D_SKEWED.flow.skewness_range
     assert low <= abs(k) <= high
@@ -198,7 +197,7 @@ def test_skewed_basis_rests_on_the_walls_and_only_the_first_carries_fluid():
     np.testing.assert_allclose(model.weights @ model.profiles / (2.0 * R), [1.0, 0.0, 0.0], atol=1e-14)
 
 
-# -- mistakes ---------------------------------------------------------------------------------------------------------
+# -- errors -----------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(("field", "arguments", "name"), [
@@ -210,7 +209,7 @@ def test_skewed_basis_rests_on_the_walls_and_only_the_first_carries_fluid():
     (RoundPipeFlow, (4.5, 0.0), "radius"), (SkewedChannelFlow, (4.5, 0.0), "half_width"),
     (SkewedChannelFlow, (4.5, R, 5.1), "skewness"), (SkewedChannelFlow, (4.5, R, np.nan), "skewness")])
 def test_errors_name_the_argument(field, arguments, name):
-    """A negative, infinite or missing number is refused by name."""
+    """A negative, infinite or missing number is rejected by name."""
     with pytest.raises(ValueError, match=name):
         field(*arguments)
 
@@ -221,7 +220,7 @@ def test_errors_name_the_argument(field, arguments, name):
     ({"nominal": ("fast",)}, "nominal must be an array"), ({"initial_std": (-1.0,)}, "initial_std must be"),
 ])
 def test_errors_of_the_model_name_the_argument(change, message):
-    """One number in m/s for each profile, and nonnegative standard deviations."""
+    """A model needs one number in m/s for each profile, and nonnegative standard deviations."""
     fields = {"half_width": R, "basis": ((1.5, 0.0, -1.5),), "nominal": (4.5,), "initial_std": (1.0,),
               "walk_std": (0.02,)}
     with pytest.raises(ValueError, match=message):
@@ -233,6 +232,6 @@ def test_errors_of_the_model_name_the_argument(change, message):
     ([1.0, np.nan, 0.0], "parameters must be finite"),
 ])
 def test_wrong_parameters_are_named(parameters, message):
-    """One finite number for each profile."""
+    """Parameters are one finite number for each profile."""
     with pytest.raises(ValueError, match=message):
         MODEL.field(parameters)

@@ -1,4 +1,4 @@
-"""Steady flows against exact solutions, against the lid-driven cavity of the literature, and against balances."""
+"""Steady flows against exact solutions, published results of the lid-driven cavity, and balances."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from shapes import polar_mesh, shaken_box, shaken_rectangle
 
 
 def uniform(*velocity):
-    """The field that has this value everywhere."""
+    """Return a field with this value everywhere."""
     return lambda points: np.broadcast_to(np.array(velocity, dtype=float), points.shape)
 
 
@@ -27,27 +27,27 @@ AT_REST = uniform(0.0, 0.0)
 
 
 def orders(errors):
-    """log₂ of how much each halving of the cells gains."""
+    """Return log₂ of the reduction of the error by each halving of the cells."""
     return np.array([np.log2(coarse / fine) for coarse, fine in pairwise(errors)])
 
 
 def side(mesh, axis, value):
-    """The facets on which a coordinate has this value."""
+    """Return the facets on which a coordinate has this value."""
     return mesh.facets_where(lambda points: np.abs(points[:, axis] - value) < 1e-9)
 
 
 def points_within(low, high, n=4000):
-    """Random points of a box."""
+    """Return random points of a box."""
     return np.random.default_rng(0).uniform(low, high, size=(n, 2))
 
 
 def rms(error):
-    """Root of the mean square of a field's values, in the manner of an L2 norm."""
+    """Return the RMS of a field's values, like an L2 norm."""
     return np.sqrt((error**2).sum(axis=-1).mean() if error.ndim == 2 else (error**2).mean())
 
 
 def gradients_at_middles(flow):
-    """∂v_a/∂x_b (n_cells, 3, 2, 2) at the middle of the edge opposite each node, from the six values of each cell."""
+    """Return ∂v_a/∂x_b (n_cells, 3, 2, 2) at the midpoint of the edge opposite each node, from six values per cell."""
     mesh = flow.mesh
     corners = np.concatenate([np.ones((len(mesh.cells), 3, 1)), mesh.points[mesh.cells]], axis=2)
     slopes = np.swapaxes(np.linalg.inv(corners)[:, 1:], 1, 2)                            # ∇λ_i, (cells, 3, 2)
@@ -61,7 +61,7 @@ def gradients_at_middles(flow):
 
 
 def cavity(cells, viscosity, grading=1.5, turn=0.0, lid_last=False):
-    """The unit square under a lid of unit speed, perhaps turned by an angle about its corner."""
+    """Return the flow in the unit square under a lid of unit speed, rotated by an angle about its corner."""
     line = graded(0.0, 1.0, cells, grading)
     square = rectangle_mesh(line, line)
     lid = side(square, 1, 1.0)
@@ -75,7 +75,7 @@ def cavity(cells, viscosity, grading=1.5, turn=0.0, lid_last=False):
 
 
 def test_poiseuille_flow_is_exact():
-    """A parabola lies in P2 and its pressure 2ν·v_max·(L − x)/R² in P1: both come out to rounding, outflow and all."""
+    """A parabola is in P2 and its pressure 2ν·v_max·(L − x)/R² in P1: both are exact to rounding, with outflow."""
     L, R, nu, parabola = 0.4, 0.05, 2e-3, PlaneChannelFlow(0.5, 0.05)
     mesh = shaken_rectangle(L, 2 * R, (12, 6), np.random.default_rng(1))
     mesh = Mesh(mesh.points - [0.0, R], mesh.cells)
@@ -87,7 +87,7 @@ def test_poiseuille_flow_is_exact():
 
 
 def test_force_with_a_linear_potential_only_makes_pressure():
-    """f = ∇(g·x) leaves the fluid at rest, with p = g·x of mean zero."""
+    """For f = ∇(g·x) the fluid is at rest, with p = g·x of mean zero."""
     mesh, g = shaken_rectangle(1.0, 0.8, (6, 5), np.random.default_rng(2)), np.array([3.0, -9.81])
     flow = steady_flow(mesh, 1e-2, [(mesh.boundary_facets, AT_REST)], force=uniform(*g))
     assert_allclose(flow.cell_velocity, 0.0, atol=1e-13)
@@ -95,9 +95,9 @@ def test_force_with_a_linear_potential_only_makes_pressure():
 
 
 def test_turning_disc_takes_the_fluid_with_it():
-    """A wall that turns makes v = Ω×r and p = Ω²r²/2; exact where a force makes up for p, which P1 does not hold.
+    """A rotating wall gives v = Ω×r and p = Ω²r²/2; exact if a force balances p, which is not in P1.
 
-    Otherwise the quadratic p is found with second order and disturbs v with third: measured orders 2.0 and 3.1.
+    Otherwise p has second order and v third order: measured orders 2.0 and 3.1.
     """
     omega, R, nu = 2.0, 0.14, 1e-3
 
@@ -145,13 +145,13 @@ def test_kovasznay_flow_is_found_with_third_order():
 # -- the lid-driven cavity --------------------------------------------------------------------------------------------
 
 def centre_lines(flow, y, x):
-    """u at heights y of the upright centre line, v at places x of the level one."""
+    """Return u at heights y of the vertical centre line, v at positions x of the horizontal one."""
     return (flow(np.stack([np.full(len(y), 0.5), y], axis=1))[:, 0],
             flow(np.stack([x, np.full(len(x), 0.5)], axis=1))[:, 1])
 
 
 def test_cavity_at_reynolds_1000():
-    """Centre lines to 1.2 % of Ghia, Ghia & Shin (1982), and ten times closer to Botella & Peyret (1998, spectral).
+    """Centre lines are within 1.2 % of Ghia, Ghia & Shin (1982), and ten times closer to Botella & Peyret (1998).
 
     Measured 1.1 % and 0.06 %. Botella & Peyret: Computers & Fluids 27, 421, Tables 9 and 10; their lid moves the other
     way.
@@ -166,7 +166,7 @@ def test_cavity_at_reynolds_1000():
 
 
 def test_turning_the_cavity_turns_the_flow():
-    """Mesh and lid turned by 35°: velocity and pressure go with them."""
+    """For mesh and lid rotated by 35°, velocity and pressure are rotated."""
     straight, turned = cavity(8, 1e-2), cavity(8, 1e-2, turn=0.61)
     axes = np.array([[np.cos(0.61), np.sin(0.61)], [-np.sin(0.61), np.cos(0.61)]])
     assert_allclose(turned.cell_velocity, straight.cell_velocity @ axes, atol=1e-10)
@@ -174,7 +174,7 @@ def test_turning_the_cavity_turns_the_flow():
 
 
 def test_shared_nodes_take_the_last_value():
-    """The lid's corners move when the lid comes last, and rest when the other walls do."""
+    """The lid's corners move if the lid is the last wall, and are at rest if the other walls are."""
     corners = np.array([[0.0, 1.0], [1.0, 1.0]])
     assert_allclose(cavity(6, 0.1)(corners), 0.0, atol=1e-12)
     assert_allclose(cavity(6, 0.1, lid_last=True)(corners), [[1.0, 0.0], [1.0, 0.0]], atol=1e-12)
@@ -184,7 +184,7 @@ def test_shared_nodes_take_the_last_value():
 
 
 def stirred_square(n):
-    """A closed square stirred by an eddy of force off its middle, at a Reynolds number of some tens."""
+    """Return a closed square stirred by an off-centre force, at a Reynolds number of some tens."""
     def force(points):
         d = points - [0.4, 0.55]
         return 0.5 * d @ np.array([[0.0, 1.0], [-1.0, 0.0]]) * np.exp(-(d**2).sum(axis=1, keepdims=True) / 0.02)
@@ -194,7 +194,7 @@ def stirred_square(n):
 
 
 def test_flow_has_no_divergence_in_the_weak_sense():
-    """∫q ∇·v = 0 for all piecewise linear q, to rounding; the integrand is quadratic, so the middles' mean is exact."""
+    """∫q ∇·v = 0 for all piecewise linear q, to rounding; the mean of midpoints is exact for quadratics."""
     flow, _ = stirred_square(10)
     divergence = np.trace(gradients_at_middles(flow), axis1=2, axis2=3)                  # (cells, middles)
     q = 0.5 * (1.0 - np.eye(3))                                                          # (middles, nodes)
@@ -205,7 +205,7 @@ def test_flow_has_no_divergence_in_the_weak_sense():
 
 
 def test_power_is_dissipated():
-    """∫f·v = ν∫|∇v|² in a closed vessel, but for ∫v·(v·∇v) where ∇·v is zero in the weak sense only: order four."""
+    """∫f·v = ν∫|∇v|² in a closed vessel, apart from ∫v·(v·∇v), since ∇·v is zero in the weak sense only: order four."""
     defects = []
     for n in (16, 32):
         flow, force = stirred_square(n)
@@ -221,7 +221,7 @@ def test_power_is_dissipated():
 
 
 def test_field_outside_is_that_of_the_nearest_wall():
-    """Beyond an open end the outflow goes on, beyond a wall the fluid rests."""
+    """Beyond an open end the outflow continues, beyond a wall the fluid is at rest."""
     mesh = rectangle_mesh(np.linspace(0.0, 1.0, 5), np.linspace(-0.5, 0.5, 5))
     parabola = PlaneChannelFlow(1.0, 0.5)
     flow = steady_flow(mesh, 0.1, [(side(mesh, 0, 0.0), parabola), (side(mesh, 1, -0.5), AT_REST),
@@ -262,13 +262,13 @@ ALL = SQUARE.boundary_facets
     (0.1, [(ALL, lambda points: points)], None, "walls must let as much fluid in as out, .* net outflow of 2 m²/s"),
 ])
 def test_errors_name_the_argument(viscosity, walls, force, match):
-    """Numbers out of range, facets inside, fields with holes and walls that only let out are refused by name."""
+    """Numbers out of range, inner facets, non-finite fields and walls with a net outflow are rejected by name."""
     with pytest.raises(ValueError, match=match):
         steady_flow(SQUARE, viscosity, walls, force=force)
 
 
 def test_three_dimensions_are_refused():
-    """A mesh of tetrahedra is refused."""
+    """A mesh of tetrahedra is rejected."""
     mesh = shaken_box((1.0, 1.0, 1.0), (1, 1, 1), np.random.default_rng(0))
     with pytest.raises(ValueError, match="mesh must be 2D, got 3D"):
         steady_flow(mesh, 1.0, [(mesh.boundary_facets, AT_REST)])

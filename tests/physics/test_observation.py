@@ -1,4 +1,4 @@
-"""Observation model: conductivity laws, the chain rule, the least concentration, the noise formula."""
+"""Observation model: conductivity laws, the chain rule, the minimum concentration, the noise formula."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ each_law = pytest.mark.parametrize("law", LAWS, ids=lambda law: type(law).__name
 
 
 def observation(law) -> ObservationModel:
-    """Four electrodes on a rectangle; the concentration lives on a mesh that does not conform to the EIT mesh."""
+    """Return a model of four electrodes on a rectangle, with a concentration on a non-conforming mesh."""
     eit_mesh = rectangle_mesh(np.linspace(0.0, 1.0, 7), np.linspace(0.0, 0.6, 5))
     cd_mesh = rectangle_mesh(np.linspace(0.0, 1.0, 5), np.linspace(0.0, 0.6, 4))
     electrodes = [eit_mesh.facets_where(lambda p, y=y, a=a: (np.abs(p[:, 1] - y) < 1e-9) & (p[:, 0] > a - 1e-9)
@@ -33,7 +33,7 @@ def concentration(model: ObservationModel, low: float = 10.0, high: float = 60.0
 
 
 def difference_quotients(model: ObservationModel, c: np.ndarray, step: float = 1e-3) -> np.ndarray:
-    """(K, L, n_cd) central differences of the voltages."""
+    """Return central differences (K, L, n_cd) of the voltages."""
     return np.stack([(model.voltages(c + e, PATTERNS) - model.voltages(c - e, PATTERNS)) / (2 * step)
                      for e in step * np.eye(len(c))], axis=-1)
 
@@ -63,7 +63,7 @@ def test_wrong_parameters_are_refused(make, match):
 # -- noise ------------------------------------------------------------------------------------------------------------
 
 def test_noise_formula():
-    """std² = (1 % of the reading)² + (0.1 % of the injection's largest voltage)² + floor², each injection by itself."""
+    """std² = (1 % of the measurement)² + (0.1 % of the injection's largest voltage)² + floor², per injection."""
     voltages = np.array([[3.0, -4.0, 0.0], [0.1, 0.0, -0.05]])
     expected = np.sqrt([[0.03**2 + 0.004**2, 0.04**2 + 0.004**2, 0.004**2],
                         [0.001**2 + 0.0001**2, 0.0001**2, 0.0005**2 + 0.0001**2]])
@@ -90,7 +90,7 @@ def test_linearisation_of_the_observation(law):
 
 @each_law
 def test_a_uniform_concentration_is_a_uniform_conductivity(law):
-    """No interpolation error in a constant: 𝓡(c) is the electrode model's for σ(c)."""
+    """A constant has no interpolation error: 𝓡(c) equals the electrode model's for σ(c)."""
     model = observation(law)
     R = model.transfer_resistance(np.full(model.interpolation.shape[1], 30.0))
     sigma = np.full(model.cem.mesh.n_nodes, float(law(np.array(30.0))))
@@ -99,7 +99,7 @@ def test_a_uniform_concentration_is_a_uniform_conductivity(law):
 
 @each_law
 def test_concentration_below_the_floor_counts_as_the_floor(law):
-    """Negative and tiny values give a positive σ and the voltages of the least concentration, with its slope."""
+    """Negative and tiny values give a positive σ and the voltages of the minimum concentration, with its slope."""
     model = observation(law)
     c = concentration(model)
     # A whole cross-section below the least concentration, so that some EIT nodes depend on such nodes only.
@@ -117,7 +117,7 @@ def test_concentration_below_the_floor_counts_as_the_floor(law):
 
 
 def test_wrong_concentrations_are_refused():
-    """Not finite, or another shape than the concentration's mesh; the least concentration must be positive."""
+    """Non-finite values, wrong shapes and a nonpositive minimum concentration are rejected."""
     model = observation(LAWS[0])
     c = concentration(model)
     for bad in (c[:-1], np.where(np.arange(len(c)) == 2, np.nan, c)):
@@ -130,7 +130,7 @@ def test_wrong_concentrations_are_refused():
 
 
 def test_arguments_are_left_alone():
-    """Neither the concentration nor the currents are written to."""
+    """Concentration and currents are unchanged."""
     model = observation(LAWS[1])
     c, currents = np.full(model.interpolation.shape[1], -1.0), PATTERNS.copy()
     model.linearise(c, currents)

@@ -15,7 +15,7 @@ from eitbench.physics.transport import ConvectionDiffusion
 
 
 def spherical_octant(radii: np.ndarray, n: int) -> Mesh:
-    """The part x, y, z ≥ 0 of the shell between the first and the last of ``radii``, n² triangles on each sphere."""
+    """Return the octant x, y, z ≥ 0 of the shell between first and last of ``radii``, n² triangles per sphere."""
     i, j = (index.ravel() for index in np.indices((n + 1, n + 1)))
     number = np.cumsum(i + j <= n).reshape(n + 1, n + 1) - 1
     up = [(number[p, q], number[p + 1, q], number[p, q + 1]) for p in range(n) for q in range(n - p)]
@@ -29,9 +29,9 @@ def spherical_octant(radii: np.ndarray, n: int) -> Mesh:
 
 @pytest.mark.parametrize(("order", "cells", "final"), [(1, (8, 16), 2e-3), (2, (5, 10), 7e-3)])
 def test_spherical_shell(order, cells, final):
-    """Current along the radii of an octant, whose sides need no electrode: 8·[(1/a − 1/b)/σ + z₁/a² + z₂/b²]/(4π).
+    """A radial current in an octant has the resistance 8·[(1/a − 1/b)/σ + z₁/a² + z₂/b²]/(4π).
 
-    Approached like h²; measured at last 2.7e-4 with P1, where two errors almost cancel, 6.4e-3 with P2.
+    It converges like h²; the last error is 2.7e-4 with P1, where two errors almost cancel, 6.4e-3 with P2.
     """
     a, b, sigma, z = 0.03, 0.1, 0.4, np.array([2e-2, 5e-2])
     exact = 2 / np.pi * ((1 / a - 1 / b) / sigma + z[0] / a**2 + z[1] / b**2)
@@ -50,7 +50,7 @@ def test_spherical_shell(order, cells, final):
 # -- convection–diffusion in a pipe -----------------------------------------------------------------------------------
 
 def round_pipe(rings, layers, **changes):
-    """A pipe of unit radius, two long, in which a laminar flow of mean 1 runs."""
+    """Return a pipe of radius 1 and length 2 with a laminar flow of mean 1."""
     mesh = extrude(uniform_disc(1.0, rings), np.linspace(0.0, 2.0, layers + 1))
     settings = {"diffusivity": 0.05, "time_step": 0.1, "substeps": 4} | changes
     return ConvectionDiffusion(mesh, RoundPipeFlow(1.0, 1.0), **settings)
@@ -80,7 +80,7 @@ def test_content_changes_by_what_crosses_inlet_and_outlet():
             c = cd.step(c, inflow[k], inflow[k + 1])
             now = flux(c)
             passed, before = passed + 0.5 * (before + now) * cd.time_step, now
-        assert before < 0                                                              # by now more leaves than enters
+        assert before < 0                                                              # the outflow exceeds the inflow
         defects.append(abs(weights @ c - passed) / (weights @ c))
     assert defects[1] < 0.025, defects
     assert np.log2(defects[0] / defects[1]) > 1.6, defects
@@ -106,6 +106,6 @@ def test_shear_disperses_as_taylor_and_aris_say():
         c = cd.step(c, 0.0, 0.0)
         share = weights * c / (weights @ c)
         variance.append(share @ (z - share @ z)**2)
-    assert weights @ c == pytest.approx(start, rel=1e-5)                              # the slug is still all inside
+    assert weights @ c == pytest.approx(start, rel=1e-5)                              # the slug is completely inside
     effective = (variance[-1] - variance[9]) / (2 * 4 * cd.time_step)
     assert effective == pytest.approx(D * (1 + 1 / 48 * (mean * a / D)**2), rel=0.01)

@@ -1,4 +1,4 @@
-"""Convection–diffusion against exact solutions, against dense linear algebra, and against itself."""
+"""Convection–diffusion against exact solutions, dense linear algebra, and itself."""
 
 from itertools import pairwise
 
@@ -18,12 +18,12 @@ from shapes import box_mesh
 
 
 def uniform(*velocity):
-    """The field that has this velocity everywhere."""
+    """Return a field with this velocity everywhere."""
     return lambda points: np.broadcast_to(np.array(velocity, dtype=float), points.shape)
 
 
 def channel(nx=12, ny=6, **changes):
-    """A short channel with 91 nodes, where dense algebra is cheap; cell Péclet number up to 19."""
+    """Return a short channel with 91 nodes, for dense algebra; cell Péclet number up to 19."""
     mesh = rectangle_mesh(np.linspace(0.0, 1.0, nx + 1), np.linspace(-0.25, 0.25, ny + 1))
     settings = {"diffusivity": 4e-3, "time_step": 0.2, "substeps": 4} | changes
     return ConvectionDiffusion(mesh, PlaneChannelFlow(1.0, 0.25), **settings)
@@ -41,12 +41,12 @@ def follow(cd, exact, steps):
 
 
 def orders(errors):
-    """log₂ of how much each halving of the mesh or the step gains."""
+    """Return log₂ of the reduction of the error by each halving of the mesh or the step."""
     return np.array([np.log2(coarse / fine) for coarse, fine in pairwise(errors)])
 
 
 def dense_step(cd, c, before, after, velocity, source=None):
-    """The scheme of the docstring with full matrices, inlet rows replaced by the given values, no reuse."""
+    """Compute the scheme of the docstring with full matrices, inlet rows replaced by prescribed values, no reuse."""
     M, K = (matrix.toarray() for matrix in _supg_matrices(cd.mesh, velocity, cd.diffusivity))
     load = M @ (np.zeros_like(c) if source is None else source)
     dt = cd.time_step / cd.substeps
@@ -86,7 +86,7 @@ def test_vanishing_diffusion_follows_the_characteristics():
 def test_gaussian_travels_and_spreads_with_second_order_in_space():
     """A Gaussian in an oblique uniform flow keeps its shape while its variance grows by 2κt.
 
-    Time steps are so short that space alone counts; measured orders 1.81, 2.00. So it is where the mesh resolves
+    Time steps are so short that the error is spatial; measured orders 1.81, 2.00. This holds if the mesh resolves
     diffusion (cell Péclet number below 2 here); between that and κ → 0 the order sinks to about 1.5, because the SUPG
     residual of linear elements lacks ∇·κ∇c.
     """
@@ -125,7 +125,7 @@ def test_shear_disperses_as_taylor_and_aris_say():
         c = cd.step(c, 0.0, 0.0)
         mass = weights * c / (weights @ c)
         variance.append(mass @ (x - mass @ x)**2)
-    assert weights @ c == pytest.approx(start, rel=1e-5)                                # the slug is still all inside
+    assert weights @ c == pytest.approx(start, rel=1e-5)                                # the slug is completely inside
     # Transverse modes decay as exp(−π²Dt/a²): after t = 5 less than 1 % of them is left.
     effective = (variance[-1] - variance[9]) / (2 * 4 * cd.time_step)
     assert effective == pytest.approx(D * (1 + 2 / 105 * (mean * a / D)**2), rel=0.01)
@@ -135,13 +135,13 @@ def test_shear_disperses_as_taylor_and_aris_say():
 
 
 def test_constant_is_preserved():
-    """A fluid of one concentration stays so, to rounding, whatever the flow does."""
+    """A constant concentration stays constant, to rounding, for any flow."""
     cd = channel()
     np.testing.assert_allclose(cd.step(np.full(91, 30.0), 30.0, 30.0), 30.0, rtol=1e-12)
 
 
 def test_closed_vessel_keeps_its_content():
-    """Without flow and inlet diffusion only levels out: ∫c stays, to rounding, and the field tends to its mean."""
+    """Without flow and inlet, diffusion conserves ∫c to rounding, and the field tends to its mean."""
     mesh = box_mesh((1.0, 1.0), (8, 8))
     cd = ConvectionDiffusion(mesh, uniform(0.0, 0.0), 0.05, 1.0, inlet=np.array([], int))
     weights = mass_matrix(mesh).sum(axis=0)
@@ -155,7 +155,7 @@ def test_closed_vessel_keeps_its_content():
 
 
 def test_discrete_fluxes_pass_through_the_boundary_only():
-    """Summed over all tests the scheme reads d/dt ∫c = −∮ c v·n: exactly, since the tests add up to one."""
+    """Summed over all test functions the scheme is exactly d/dt ∫c = −∮ c v·n, since their sum is one."""
     cd, flow = channel(), PlaneChannelFlow(1.0, 0.25)
     M, K = _supg_matrices(cd.mesh, flow, cd.diffusivity)
     np.testing.assert_allclose(M.sum(axis=0), mass_matrix(cd.mesh).sum(axis=0), atol=1e-15)
@@ -202,7 +202,7 @@ def test_content_changes_by_what_crosses_inlet_and_outlet():
 
 
 def test_supg_matrices_are_those_of_brooks_and_hughes():
-    """For a uniform velocity all integrals are known: compared with a hand-written assembly, cell by cell."""
+    """For a uniform velocity all integrals equal a hand-written assembly, cell by cell."""
     mesh, kappa, v = box_mesh((1.0, 1.0), (4, 3)), 0.01, np.array([1.0, 0.3])
     M, K = (np.zeros((mesh.n_nodes, mesh.n_nodes)) for _ in range(2))
     for cell, area in zip(mesh.cells, mesh.volumes, strict=True):
@@ -222,9 +222,9 @@ def test_supg_matrices_are_those_of_brooks_and_hughes():
 @pytest.mark.parametrize(("substeps", "columns"), [
     (1, 1), (4, 1), *((3, k) for k in (7, 8, 9, MIN_WIDE_COLUMNS, 31, 32, 33, 70))])
 def test_step_is_the_stated_scheme(substeps, columns):
-    """Equal to a dense implementation of two backward-Euler halves and Crank–Nicolson, with a moving inlet value. Of
-    many columns, in panels that are full and ones that are not, each has the bits that it has alone, whatever was in
-    working memory before; the arguments stay as they are."""
+    """A step equals a dense implementation of two backward-Euler halves and Crank–Nicolson, with varying inflow. For
+    many columns, in full and partial panels, each is bit-identical to a single column, independent of the previous
+    content of the working memory; the arguments are unchanged."""
     cd, rng = channel(substeps=substeps), np.random.default_rng(2)
     arguments = [rng.normal(size=(n, 70))[:, :columns] for n in (91, 7, 7)]
     kept = [array.copy() for array in arguments]
@@ -251,13 +251,13 @@ def test_sub_steps_converge_with_second_order():
 
 
 def test_node_to_node_noise_is_damped():
-    """A checkerboard, which Crank–Nicolson alone would keep, is gone after a step, even one of a single sub-step."""
+    """A checkerboard, which Crank–Nicolson alone conserves, is damped in one step, even with a single sub-step."""
     cd = channel(substeps=1, diffusivity=0.2, time_step=0.5)
     i, j = np.divmod(np.arange(91), 7)
     checkerboard = (-1.0)**(i + j)
 
     def largest_jump(c):
-        section = c.reshape(13, 7)[1:]                                                  # the inlet is given, not moved
+        section = c.reshape(13, 7)[1:]                                                  # the inlet is prescribed
         return max(np.abs(np.diff(section, axis=axis)).max() for axis in (0, 1))
 
     assert largest_jump(checkerboard) == 2.0
@@ -283,7 +283,7 @@ def test_evolution_model_is_the_step():
 
 
 def test_nodal_noise_is_a_source_over_the_step():
-    """H e is what the source e/Δt leaves behind: sub-stepped with the same scheme, and in continuous time."""
+    """H e is the contribution of the source e/Δt: by sub-steps of the same scheme, and in continuous time."""
     cd, flow, rng = channel(), PlaneChannelFlow(1.0, 0.25), np.random.default_rng(4)
     H = cd.evolution_model().H
     e = rng.normal(size=91)
@@ -325,7 +325,7 @@ def test_fluid_enters_where_it_points_inwards():
 
 
 def test_turning_the_channel_changes_nothing():
-    """Mesh and velocity turned by 35°: the same inlet nodes and the same step."""
+    """Mesh and velocity rotated by 35° have the same inlet nodes and the same step."""
     straight, flow, rng = channel(), PlaneChannelFlow(1.0, 0.25), np.random.default_rng(5)
     turn = np.array([[np.cos(0.61), np.sin(0.61)], [-np.sin(0.61), np.cos(0.61)]])
     turned = ConvectionDiffusion(Mesh(straight.mesh.points @ turn, straight.mesh.cells),
@@ -336,7 +336,7 @@ def test_turning_the_channel_changes_nothing():
 
 
 def test_cube_of_tetrahedra():
-    """3D: the inlet faces are found, a constant stays, F and Y make the step."""
+    """Inlet faces in 3D are found, a constant stays constant, and F and Y equal the step."""
     mesh = box_mesh(np.ones(3), (3, 3, 4))
     cd = ConvectionDiffusion(mesh, uniform(0.0, 0.5, 1.0), 0.01, 0.2)
     np.testing.assert_array_equal(cd.inlet, np.flatnonzero((mesh.points[:, 1:] == 0).any(axis=1)))
@@ -368,14 +368,14 @@ def test_inlet_entries_of_the_state_are_replaced():
     ({"inlet": np.array([91])}, "inlet"), ({"inlet": np.array([-1])}, "inlet"),
 ])
 def test_constructor_errors_name_the_argument(changes, name):
-    """Numbers out of range are refused by name."""
+    """Numbers out of range are rejected by name."""
     with pytest.raises(ValueError, match=name):
         channel(**changes)
 
 
 @pytest.mark.parametrize("velocity", [uniform(np.nan, 0.0), lambda points: points[:, 0]], ids=["NaN", "shape"])
 def test_velocity_must_be_finite_and_a_vector(velocity):
-    """A field with holes or of the wrong shape is refused by name."""
+    """A non-finite field or a wrong shape is rejected by name."""
     with pytest.raises(ValueError, match="velocity"):
         ConvectionDiffusion(channel().mesh, velocity, 1e-3, 0.1, inlet=np.arange(7))
 
@@ -385,6 +385,6 @@ def test_velocity_must_be_finite_and_a_vector(velocity):
     (np.zeros(91), np.zeros(6), 0.0, "inflow_before"), (np.zeros((91, 2)), 0.0, np.zeros((7, 3)), "inflow_after"),
 ])
 def test_step_errors_name_the_argument(c, before, after, name):
-    """States and inflows of the wrong shape, or not finite, are refused by name."""
+    """States and inflows of the wrong shape, or not finite, are rejected by name."""
     with pytest.raises(ValueError, match=name):
         channel().step(c, before, after)

@@ -15,13 +15,13 @@ INLET = np.arange(7)
 
 
 def box():
-    """The unit cube in tetrahedra; 60 nodes, bent so that no cell's side follows an axis."""
+    """Return the unit cube in tetrahedra; 60 nodes, deformed so that sides of cells are not parallel to an axis."""
     mesh = box_mesh(np.ones(3), (3, 4, 2))
     return Mesh(mesh.points + 0.05 * np.sin(3 * mesh.points[:, [1, 2, 0]]), mesh.cells)
 
 
 def along_x(profile):
-    """The field profile(y/R) along x in the channel, R = 0.25 m."""
+    """Return the field profile(y/R) along x in the channel, R = 0.25 m."""
     return lambda points: np.column_stack([profile(points[:, 1] / 0.25), np.zeros(len(points))])
 
 
@@ -30,7 +30,7 @@ PARABOLA, SKEW, FLAT = (along_x(profile) for profile in (
 
 
 def eddy(points):
-    """Swirls with a component across the channel, without divergence and zero nowhere along a line of cells."""
+    """Return divergence-free swirls with a component across the channel, nonzero along each line of cells."""
     x, y = points.T
     return np.column_stack([np.sin(3 * x + 1) * np.cos(7 * y + 0.3) + 0.3, -3 / 7 * np.cos(3 * x + 1)
                             * np.sin(7 * y + 0.3) - 0.2])
@@ -41,7 +41,7 @@ def still(points):
 
 
 def half(points):
-    """Flow in the first half of the channel only; cells end where it does."""
+    """Return a flow in the first half of the channel only, which ends at a side of cells."""
     return PARABOLA(points) * (points[:, :1] < 0.5)
 
 
@@ -55,7 +55,7 @@ def build(velocity, mesh=CHANNEL, inlet=INLET, **changes):
 
 
 def by_differences(velocity, direction, state, h=1e-4, **settings):
-    """∂step/∂θ by differences of steps of new models, with errors of fourth order in h."""
+    """Return ∂step/∂θ by differences of steps of new models, with errors of fourth order in h."""
     def slope(h):
         ahead, behind = (build(moved(velocity, direction, theta), **settings).step(*state) for theta in (h, -h))
         return (ahead - behind) / (2 * h)
@@ -85,22 +85,22 @@ def assert_derivatives(velocity, directions, state, tolerance=1e-8, **settings):
     (1e-3, {"diffusivity": 0.5}),
 ], ids=["mild", "one sub-step", "convective", "diffusive", "creeping"])
 def test_derivatives_in_the_channel(speed, changes):
-    """Along three axial profiles, not all symmetric, from a skew base flow: central differences to 1e-8.
+    """Derivatives along three axial profiles from a skew base flow equal central differences to 1e-8.
 
-    Cell Péclet numbers go up to 17, to 7e7, and to 0.1 and 1e-4 where diffusion rules.
+    Cell Péclet numbers are up to 17, to 7e7, and to 0.1 and 1e-4 with dominant diffusion.
     """
     base = moved(PlaneChannelFlow(speed, 0.25), SKEW, 0.7 * speed)
     assert_derivatives(base, [PARABOLA, SKEW, FLAT], random_state(np.random.default_rng(0)), **changes)
 
 
 def test_derivatives_in_a_flow_of_any_direction():
-    """A flow and directions oblique to all cells, with rotated upwinding: central differences to 1e-8."""
+    """Derivatives for a flow and directions oblique to all cells equal central differences to 1e-8."""
     flow = moved(lambda points: np.full_like(points, [1.0, 0.37]), eddy, 0.1)
     assert_derivatives(flow, [eddy, PARABOLA], random_state(np.random.default_rng(1)))
 
 
 def test_derivatives_on_tetrahedra():
-    """Derivatives in a bent cube, in three dimensions."""
+    """Derivatives in a deformed cube, in three dimensions."""
     mesh = box()
     inlet = np.flatnonzero(np.arange(60) < 15)
     flow, other = (lambda points, a=a, b=b: np.array(a) + np.sin(points[:, [1, 2, 0]]) * b
@@ -109,14 +109,14 @@ def test_derivatives_on_tetrahedra():
 
 
 def test_derivatives_where_the_fluid_stands_still():
-    """No flow in half of the channel, or nowhere at all: there the scheme is followed along each direction."""
+    """Without a flow in half of the channel, or anywhere, derivatives follow the scheme along each direction."""
     state = random_state(np.random.default_rng(3))
     for flow, directions in ((half, [half, PARABOLA, SKEW]), (still, [half, PARABOLA, eddy])):
         assert_derivatives(flow, directions, state, tolerance=1e-6)
 
 
 def test_a_kink_counts_half_from_either_side():
-    """Fluid along the sides of cells, moved across them: the derivative is the mean of both one-sided ones."""
+    """For a flow along sides of cells, derivatives across them are the mean of both one-sided ones."""
     flow, state = PlaneChannelFlow(1.0, 0.25), random_state(np.random.default_rng(4))
 
     def across(points):
@@ -130,7 +130,7 @@ def test_a_kink_counts_half_from_either_side():
     np.testing.assert_allclose(derivative, 0.5 * (up + down), atol=1e-4 * scale)
 
 
-# -- laws -------------------------------------------------------------------------------------------------------------
+# -- properties -------------------------------------------------------------------------------------------------------
 
 
 def test_derivatives_at_the_inlet_are_zero():
@@ -163,6 +163,6 @@ def test_transition_is_that_of_the_evolution_model():
     (np.zeros(91), 0.0, 0.0, [], "^directions"),
 ])
 def test_errors_name_the_argument(c, before, after, directions, name):
-    """States, inflows and directions of the wrong shape, or not finite, are refused by name."""
+    """States, inflows and directions of the wrong shape, or not finite, are rejected by name."""
     with pytest.raises(ValueError, match=name):
         build(eddy).velocity_derivatives(c, before, after, directions)

@@ -6,7 +6,7 @@ from xml.etree import ElementTree
 
 
 class Page(HTMLParser):
-    """Tags with attributes, and text, of a page; unbalanced tags are an error."""
+    """Parse tags with attributes, and text, of a page; raise an error for unbalanced tags."""
 
     VOID = ("meta", "img", "br", "link", "wbr", "input")
 
@@ -32,7 +32,7 @@ class Page(HTMLParser):
         self.text.append(data)
 
     def attributes(self, name):
-        """Every value of an attribute."""
+        """Return all values of an attribute."""
         return [attributes[name] for _, attributes in self.tags if name in attributes]
 
 

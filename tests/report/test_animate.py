@@ -10,7 +10,7 @@ from tiny import SCENARIO
 
 
 def test_each_field_has_a_panel_of_its_own():
-    """In one colour scale, one below the other: what is alike looks alike, and what is not does not."""
+    """Panels are below each other in one colour scale: equal estimates have equal pixels, different ones have not."""
     env = gym.make("eitbench/Pipe2D-v0", world=SCENARIO).unwrapped
     task = env.task
     low, high = (np.full(task.mesh.n_nodes, factor * task.expected_concentration) for factor in (0.6, 1.8))
@@ -23,6 +23,6 @@ def test_each_field_has_a_panel_of_its_own():
 
 
 def test_policies_are_drawn_alone(tmp_path):
-    """Each has measurements of its own."""
+    """Several policies are rejected: their measurements differ."""
     with pytest.raises(ValueError, match="policy must be one for eitbench/Pipe2DInjection-v0, got a, b"):
         animate("eitbench/Pipe2DInjection-v0", ["a", "b"], "dev:0", None, tmp_path / "x.webp")

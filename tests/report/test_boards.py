@@ -1,4 +1,4 @@
-"""Leaderboards: ranks and means against numbers done by hand, one story in the table, CSV and Markdown, up to date."""
+"""Leaderboards: ranks and means computed by hand; table, CSV and Markdown agree and are up to date."""
 
 import io
 import subprocess
@@ -25,7 +25,7 @@ TANK = "eitbench/RotatingTank2D-v0"
 
 
 def times(factor, errors=FLOOR):
-    """Errors of a method that is so much better in every episode."""
+    """Return errors of a method that is better by a constant factor in every episode."""
     return [factor * error for error in errors]
 
 
@@ -34,7 +34,7 @@ def floor(**changes):
 
 
 def table_of(*records):
-    """The rows of boards, by method, of the one board that there is."""
+    """Return the rows of a single leaderboard by method."""
     return boards(list(records)).set_index("method")
 
 
@@ -42,27 +42,27 @@ def table_of(*records):
 
 
 def test_ranks_and_means_by_hand():
-    """a halves the floor's error in each episode, b nearly so, c is worse: 1, 2 and 3; the floor has none."""
+    """a halves the naive error in each episode, b nearly so, c is worse: ranks 1, 2 and 3; the baseline has no rank."""
     table = table_of(floor(), record("c", times(0.8)), record("a", times(0.5)), record("b", times(0.51)))
     assert list(table.index) == ["a", "b", "c", "homogeneous"]
     assert list(table["rank"][:3]) == [1, 2, 3] and table["rank"].isna()["homogeneous"]
     assert list(table["note"]) == ["", "", "", "floor"]
     assert table["error"]["homogeneous"] == pytest.approx(0.2325) and table["error"]["a"] == pytest.approx(0.11625)
     assert table["gain"]["a"] == pytest.approx(0.5) and table["gain"]["homogeneous"] == 0.0
-    assert table["gain_low"]["a"] == pytest.approx(0.5) == table["gain_high"]["a"]      # the same in each episode
+    assert table["gain_low"]["a"] == pytest.approx(0.5) == table["gain_high"]["a"]      # equal in each episode
     value, low, high = stratified_bootstrap({"x": FLOOR}, lambda x: x.mean(axis=-1))
     assert tuple(table.loc["homogeneous", ["error", "error_low", "error_high"]]) == pytest.approx((value, low, high))
 
 
 def test_what_cannot_be_told_apart_shares_a_rank():
-    """Now one is better and now the other: both have rank 1."""
+    """Two methods that are better in different episodes both have rank 1."""
     wobble = [1, -1, 1, -1, -1, 1, 1, -1]
     a, b = ([0.1 + sign * 0.01 * w for w in wobble] for sign in (1, -1))
     assert list(table_of(floor(), record("a", a), record("b", b))["rank"][:2]) == [1, 1]
 
 
 def test_gain_is_the_interquartile_mean():
-    """Of 1 − e/floor in the same episodes: of eight gains the two lowest and the two highest are left out."""
+    """The mean of 1 − e/naive in the same episodes omits the two lowest and the two highest of eight skill scores."""
     gains = [0.9, -3.0, 0.5, 0.4, 0.6, 0.7, 0.99, 0.1]
     errors = [floor * (1 - gain) for floor, gain in zip(FLOOR, gains, strict=True)]
     table = table_of(floor(), record("a", errors))
@@ -71,7 +71,7 @@ def test_gain_is_the_interquartile_mean():
 
 
 def test_few_episodes_have_no_interval():
-    """Five are too few to claim one; nobody is then shown to be better."""
+    """Five episodes are too few for an interval; then all methods are tied."""
     table = table_of(record("homogeneous", FLOOR[:5], role="floor"), record("a", times(0.1, FLOOR[:5])),
                      record("b", times(0.9, FLOOR[:5])))
     assert table[["error_low", "error_high", "gain_low", "gain_high"]].isna().all(axis=None)
@@ -80,7 +80,7 @@ def test_few_episodes_have_no_interval():
 
 
 def test_who_has_no_rank():
-    """Floors, references, privileged ones, whoever failed or left out an episode: listed, and count for nobody's."""
+    """Naive baselines, oracles, privileged methods, and methods with failed or missing episodes are listed only."""
     table = table_of(floor(), record("reference", times(0.01), role="reference"),
                      record("seer", times(0.02), privileged=True, role="reference"), record("all", times(0.9)),
                      record("failing", [*times(0.1)[:7], None]), record("few", times(0.1)[:7]))
@@ -92,7 +92,7 @@ def test_who_has_no_rank():
 
 
 def test_the_episodes_are_those_of_the_floor():
-    """More seeds than the floor's change neither a mean nor who is complete; a failure among them does."""
+    """More seeds than the naive baseline's change neither means nor completeness; a failure among them does."""
     more = {f"test:{i}": error for i, error in enumerate([*times(0.5), 9.0, 9.0])}
     table = table_of(floor(), record("a", more), record("b", times(0.6)), record("c", more | {"test:9": None}),
                      record("elsewhere", {"test:50": 0.001}))
@@ -101,7 +101,7 @@ def test_the_episodes_are_those_of_the_floor():
 
 
 def test_aggregate_of_a_class():
-    """Ranked by the gains over all environments, of methods that are complete in each; pooled interquartile mean."""
+    """Methods that are complete in all environments are ranked by the pooled interquartile mean of skill scores."""
     pipe, tank = [0.5 + 0.01 * i for i in range(8)], [0.3 + 0.02 * i for i in range(8)]
 
     def made(gains):
@@ -122,7 +122,7 @@ def test_aggregate_of_a_class():
 
 
 def test_an_environment_with_arguments_has_no_part_in_an_aggregate():
-    """It would shut out all who did not play it: two records with an invented name, and one method is left."""
+    """An environment without a baseline would exclude all methods without it: two records with an invented name."""
     honest = [floor(), floor(id=TANK), *(record(name, times(0.5), id=id) for name in "ab"
                                          for id in (BOARD_IDS["filter"], TANK))]
     name = "eitbench-Pipe2D-v0-deadbeef"
@@ -134,7 +134,7 @@ def test_an_environment_with_arguments_has_no_part_in_an_aggregate():
 
 
 def test_nobody_s_own_floor_empties_an_aggregate():
-    """Of an environment that no official floor has played: its two records would shut out all who did not play it."""
+    """Self-reported baselines add no environment: its two records would exclude all methods without it."""
     honest = [floor(official=True), floor(id=TANK, official=True),
               *(record(name, times(0.5), id=id) for name in "ab" for id in (BOARD_IDS["filter"], TANK))]
     id = "eitbench/Pipe3D-v0"
@@ -144,7 +144,7 @@ def test_nobody_s_own_floor_empties_an_aggregate():
 
 
 def test_an_aggregate_is_ranked_by_what_orders_it():
-    """By the interquartile mean of gains, which a disaster leaves as it is; a board of one environment by the mean."""
+    """Aggregates use the interquartile mean of skill scores, which is robust to outliers; environments use the mean."""
     def made(gains):
         return [floor * (1 - gain) for floor, gain in zip(FLOOR, gains, strict=True)]
 
@@ -158,17 +158,17 @@ def test_an_aggregate_is_ranked_by_what_orders_it():
     assert list(total.index) == ["daring", "steady", "slow", "homogeneous"]
     assert dict(total["rank"].dropna()) == {"daring": 1, "steady": 2, "slow": 3}
     assert list(one.index[:2]) == ["steady", "slow"] and dict(one["rank"].dropna()) == {
-        "steady": 1, "slow": 2, "daring": 1}                           # too scattered to be beaten
+        "steady": 1, "slow": 2, "daring": 1}                           # too scattered for a significant difference
 
 
 def test_targets_at_rest_are_a_class_of_their_own():
-    """They are not averaged with those that flow."""
+    """Stationary targets are not averaged with flows."""
     assert record_category(record("a", [0.1], id="eitbench/StationaryTank2D-v0")) == "stationary"
     assert [record_category(record("a", [0.1], board=board)) for board in BOARD_IDS] == list(BOARD_IDS)
 
 
 def test_injection_counts_from_the_random_pair():
-    """The floor of policies."""
+    """Random pairs are the naive baseline of policies."""
     table = table_of(record("random_pair", FLOOR, board="injection", role="floor"),
                      record("greedy_a", times(0.25), board="injection", scores={"spent": 40}))
     assert table["gain"]["greedy_a"] == pytest.approx(0.75) and table["spent"]["greedy_a"] == 40
@@ -176,7 +176,7 @@ def test_injection_counts_from_the_random_pair():
 
 
 def test_time_in_products_and_memory():
-    """The fastest episode, in units of its own processor's matrix product, the median of all; 10⁶ bytes at most."""
+    """Time is of the fastest episode, in units of the processor's median matrix product; memory is the maximum."""
     mine = record("a", FLOOR, scores={"seconds_per_step": 0.02})
     slow = RUN | {"machine": RUN["machine"] | {"processor": "An old abacus", "matmul_seconds": 0.2}}
     episodes = [episode | {"run": i % 2, "peak_memory": 10**8 + i} for i, episode in enumerate(mine["episodes"])]
@@ -191,13 +191,13 @@ def test_time_in_products_and_memory():
 
 
 def test_only_test_seeds():
-    """Development scores are no leaderboard's."""
+    """Leaderboards contain no dev scores."""
     with pytest.raises(ValueError, match=r"made of test seeds; eitbench-Pipe2D-v0--a--\w+--dev\.json has dev"):
         boards([record("a", {"dev:0": 0.1})])
 
 
 def test_old_versions_are_listed_and_not_mixed():
-    """Neither rank nor gain of the new board know of old records; the Markdown names them."""
+    """Ranks and skill scores do not depend on superseded records; the Markdown names them."""
     old = record("b", times(0.1), version="v1", finished="2026-01-01")
     records = [floor(), record("b", times(0.5), version="v2"), old]
     assert list(boards(records)["version"]) == ["v2", "v1"] and boards(records)["rank"].max() == 1
@@ -206,12 +206,12 @@ def test_old_versions_are_listed_and_not_mixed():
     assert "Superseded" not in render(collect(records[:2]))["leaderboard.md"]
 
 
-# -- one story --------------------------------------------------------------------------------------------------------
+# -- consistency ------------------------------------------------------------------------------------------------------
 
 
 @pytest.fixture
 def folder(tmp_path):
-    """A folder of records on three boards."""
+    """Return a folder of records on three leaderboards."""
     random = np.random.default_rng(7)
     three = random.uniform(0.1, 0.2, (3, 8)).tolist()
     for each in (floor(official=True), floor(id=TANK, official=True),
@@ -224,7 +224,7 @@ def folder(tmp_path):
 
 
 def test_csv_and_markdown_agree_with_the_episodes(folder):
-    """Means of the CSV are those of the tidy table, and the Markdown shows them, rounded."""
+    """Means in the CSV equal the data frame, and the Markdown shows them rounded."""
     texts, frame = render(collect(read_records(folder))), load(folder)
     table = pd.read_csv(io.StringIO(texts["leaderboard.csv"]), keep_default_na=True)
     frame = frame[~frame["outdated"]]
@@ -253,7 +253,7 @@ def test_csv_and_markdown_agree_with_the_episodes(folder):
 
 
 def test_load_is_tidy(folder):
-    """A row for each score of each episode; failures are there, outdated ones are marked, none of it is mixed up."""
+    """Each score of each episode has a row; failures are included, and outdated records are marked."""
     frame = eitbench.bench.load(folder)
     assert not frame.duplicated(["environment", "method", "version", "seed", "metric"]).any()
     errors = frame[(frame["metric"] == "error") & (frame["environment"] == "eitbench/Pipe2D-v0")]
@@ -268,14 +268,14 @@ def test_load_is_tidy(folder):
     mine["episodes"] = [episode | {"peak_memory": 10**8} for episode in mine["episodes"]]
     write_record(folder, mine)
     alone = eitbench.bench.load(folder).query("method == 'isolated'")
-    assert list(alone[alone["status"] == "failed"]["metric"]) == ["error"]        # a single row, whatever it held
+    assert list(alone[alone["status"] == "failed"]["metric"]) == ["error"]        # a single row, for any content
     assert dict(alone[alone["status"] == "ok"].set_index("metric")["value"])["peak_memory"] == 1e8
     spent = frame[frame["metric"] == "spent"]
     assert set(spent["board"]) == {"injection"} and set(spent["value"]) == {3.0}
 
 
 def test_the_example_in_the_docs_runs(folder):
-    """docs/read_leaderboards.py on these records: it prints each version's mean, the best first."""
+    """docs/read_leaderboards.py prints each version's mean, the best first."""
     write_record(folder, record("a", times(0.8), version="2"))
     done = subprocess.run([sys.executable, str(ROOT / "docs" / "read_leaderboards.py"), str(folder)], check=True,
                           capture_output=True, text=True)
@@ -287,11 +287,11 @@ def test_the_example_in_the_docs_runs(folder):
     assert [float(line.split()[2]) for line in lines] == pytest.approx(list(best), abs=5e-5)
 
 
-# -- self-reported records beside official ones -----------------------------------------------------------------------
+# -- self-reported and official records --------------------------------------------------------------------------------
 
 
 def official():
-    """Floor, reference and two methods in two environments."""
+    """Return records of naive baseline, oracle and two methods in two environments."""
     return [record(name, times(factor), id=id, version="v1", role=role, official=True)
             for id in (BOARD_IDS["filter"], TANK)
             for name, factor, role in (("homogeneous", 1.0, "floor"), ("true_model_smoother", 0.1, "reference"),
@@ -313,7 +313,7 @@ def official_rows(records):
     [record("c", times(0.9), runs=[RUN | {"machine": RUN["machine"] | {"matmul_seconds": 1e-9}}] * 99)],
 ], ids=["floor", "method", "reference", "elsewhere", "anchor of the skill", "matrix products"])
 def test_a_self_reported_record_changes_no_official_number(strangers):
-    """Not by a version that was never published, nor by a floor, a reference or a time of its own."""
+    """Ranks do not depend on unpublished versions, self-reported baselines, oracles or times."""
     before, after = official_rows(official()), official_rows([*official(), *strangers])
     assert before.keys() == after.keys() and len(before) == 12 and any(key[0] == ALL for key in before)
     for key, row in before.items():

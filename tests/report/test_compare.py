@@ -1,4 +1,4 @@
-"""Two methods compared: the numbers are those of the statistics, on the episodes that both have."""
+"""Comparison of two methods: numbers equal the statistics on their common episodes."""
 
 import math
 import re
@@ -31,7 +31,7 @@ PIPE_NAME, TANK_NAME = "eitbench/Pipe2D-v0", "eitbench/RotatingTank2D-v0"
 
 
 def two_methods():
-    """a is better in the tank, and in the pipe perhaps."""
+    """Return records in which a is better in the tank and not significantly in the pipe."""
     random = np.random.default_rng(3)
     hard = random.lognormal(-2.0, 0.5, (2, 12))
     a, b = hard * random.uniform(0.8, 1.1, (2, 12)), hard * random.uniform(0.9, 1.2, (2, 12))
@@ -45,7 +45,7 @@ def errors_of(records):
 
 
 def test_numbers_are_those_of_the_statistics():
-    """Environment by environment: differences, shares, and their intervals."""
+    """Each environment has differences, fractions and their intervals."""
     a, b = two_methods()
     table = compare(a, b).set_index("environment")
     assert list(table.index) == [PIPE_NAME, TANK_NAME] and list(table["episodes"]) == [12, 12]
@@ -64,8 +64,8 @@ def test_numbers_are_those_of_the_statistics():
 
 
 def test_over_environments_gains_are_compared():
-    """a halves the error of the pipe and is a little worse in the tank, whose errors are a hundred times larger: by
-    gains it is better, as the boards say of the same records. Without floors there is nothing over all."""
+    """a halves the error of the pipe and is slightly worse in the tank, with errors a hundred times larger: by
+    skill scores it is better, as on the leaderboards. Without naive baselines the aggregate is empty."""
     floor = [record("homogeneous", [scale] * 12, official=True, **where)
              for scale, where in ((0.02, {}), (2.0, {"id": TANK}))]
     noise = 1.0 + 0.01 * np.random.default_rng(1).normal(size=12)
@@ -93,7 +93,7 @@ def test_over_environments_gains_are_compared():
 
 
 def test_only_shared_episodes_count():
-    """By hand: of three seeds each they share one without a failure."""
+    """Two methods with three seeds each have one common seed without a failure."""
     a = [record("a", {"test:0": 0.1, "test:1": None, "test:2": 0.3})]
     b = [record("b", {"test:0": 0.4, "test:1": 0.1, "test:3": 0.3}), record("b", [0.1], id=TANK)]
     (row,) = compare(a, b).to_dict("records")
@@ -105,7 +105,7 @@ def test_only_shared_episodes_count():
 
 
 def test_what_cannot_be_compared():
-    """Other environments, other seeds."""
+    """Methods in different environments or seeds cannot be compared."""
     a = [record("a", [0.1])]
     for b in ([record("b", [0.1], id=TANK)], [record("b", {"test:9": 0.1})], [record("b", {"dev:0": 0.1})],
               [record("b", [None])]):
@@ -114,7 +114,7 @@ def test_what_cannot_be_compared():
 
 
 def test_records_are_found_by_name_version_and_file(tmp_path, monkeypatch):
-    """A name is enough where there is one version of it."""
+    """A name is sufficient if it has one version."""
     monkeypatch.setattr(comparison, "BUNDLED_RECORDS", tmp_path)
     a, (b, _) = two_methods()
     paths = [write_record(tmp_path, each) for each in [*a, b]]
@@ -132,13 +132,13 @@ def test_records_are_found_by_name_version_and_file(tmp_path, monkeypatch):
     assert find_records("c", tmp_path) == ours[1:] and find_records("c@v1", tmp_path) == ours[:1]
     write_record(tmp_path, tenth := record("c", [0.1], version="v10"))
     assert find_records("c@v1", tmp_path) == ours[:1] and find_records("c", tmp_path) == [tenth]
-    for nobody in ("d", "c@v", f"a@{sha('a1')[:3]}"):                # of digits four are enough, fewer are not
+    for nobody in ("d", "c@v", f"a@{sha('a1')[:3]}"):                # four digits are sufficient
         with pytest.raises(ValueError, match=f"record of {nobody} "):
             find_records(nobody, tmp_path)
 
 
 def test_words_follow_from_the_intervals():
-    """The verdict names who is better, if anybody; the Markdown is a table of the same text."""
+    """The conclusion names the better method, if significant; the Markdown is a table of the same text."""
     a, b = two_methods()
     table = compare(a, b)
     text = said(comparison_table(table, "mine", "yours"))
@@ -156,7 +156,7 @@ def test_words_follow_from_the_intervals():
 
 
 def test_who_is_not_in_the_folder_comes_with_the_package(tmp_path, monkeypatch):
-    """After a first submission, in a folder of one's own: my method against ours, and our floors."""
+    """After a first submission in a user's folder, the method is compared with built-in ones and naive baselines."""
     shipped, own = tmp_path / "shipped", tmp_path / "own"
     monkeypatch.setattr(comparison, "BUNDLED_RECORDS", shipped)
     ours, floor = record("kalman_filter", [0.1], version="v1"), record("homogeneous", [0.2], role="floor")
@@ -167,7 +167,7 @@ def test_who_is_not_in_the_folder_comes_with_the_package(tmp_path, monkeypatch):
 
 
 def test_in_a_terminal_lines_are_not_wrapped():
-    """Names stand above, and what has no room is named below."""
+    """Names are above the table, and omitted columns are named below."""
     a, b = two_methods()
     table = compare(a, b)
     whole, narrow = (format_comparison(table, "a_long_name", "another", "error", letters) for letters in (200, 60))

@@ -1,4 +1,4 @@
-"""Third-party text in records is text on every page; damaged records are named and change nothing."""
+"""Third-party text in records is escaped on every page; damaged records are named and ignored."""
 
 import re
 from pathlib import Path
@@ -24,7 +24,7 @@ UNSEEN = r"[\x00-\x08\x0b-\x1f\x7f-\x9f\u200b-\u200f\u2028-\u202e\u2066-\u2069]"
 
 
 def hostile(text):
-    """Records with a text wherever they have one: title, parameters, message, command, machine and arguments."""
+    """Return records with a text in each field of text: title, parameters, message, command, machine, arguments."""
     id = BOARD_IDS["filter"]
     given = {"assume": {text: text}}
     machine = RUN["machine"] | {"processor": text}
@@ -40,7 +40,7 @@ def hostile(text):
 
 @pytest.mark.parametrize("text", TEXTS)
 def test_text_stays_text(text, tmp_path):
-    """On the site, the results page and in Markdown: no tag, link or hidden character of it."""
+    """Site, HTML report and Markdown contain no tag, link or hidden character of the text."""
     records = hostile(text)
     site = collect(records)
     pages = {path: content.decode() for path, content in render_site(site).items() if path.endswith(".html")}
@@ -59,12 +59,12 @@ def test_text_stays_text(text, tmp_path):
     assert not re.search(r"(?<!\\)<(script|b|img)\b|(?<!\\)\]\(http://x", markdown)
     for block in re.findall(r"(?:^\|.*\n)+", markdown, flags=re.MULTILINE):
         assert len({len(re.findall(r"(?<!\\)\|", line)) for line in block.splitlines()}) == 1
-    if text == "=1+1":                                        # a spreadsheet would compute it
+    if text == "=1+1":                                        # a spreadsheet would evaluate it
         assert ",'=1+1," in texts["leaderboard.csv"]
 
 
 def leaderboard(folder):
-    """Exit status, and standard output and error without boxes and line breaks."""
+    """Return exit status, and standard output and error without boxes and line breaks."""
     done = CliRunner().invoke(app, ["leaderboard", "--records", str(folder)])
     if done.exception is not None and not isinstance(done.exception, SystemExit):
         raise done.exception
@@ -72,12 +72,12 @@ def leaderboard(folder):
 
 
 def content(folder):
-    """Path -> bytes, of all files."""
+    """Map the path of each file to its bytes."""
     return {path.relative_to(folder): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
 def test_damaged_records_are_named_and_change_nothing(tmp_path):
-    """Exit status 1, and the same files as without them."""
+    """Damaged records lead to exit status 1, and the other files are as without them."""
     for name in ("alone", "among"):
         for each in (record("homogeneous", [0.2, 0.3], role="floor", official=True), record("mine", [0.1, 0.2])):
             write_record(tmp_path / name / "results", each)
@@ -99,7 +99,7 @@ def test_damaged_records_are_named_and_change_nothing(tmp_path):
 
 @pytest.mark.parametrize("left", ["", "x.json", "notes.txt"])
 def test_a_folder_without_records_deletes_nothing(left, tmp_path):
-    """A mistyped folder, or one with damaged records only: exit status 2, and all is as it was."""
+    """A missing folder, or one with damaged records only, leads to exit status 2 without changes."""
     write_record(tmp_path / "results", record("homogeneous", [0.2, 0.3], role="floor"))
     assert leaderboard(tmp_path / "results")[0] == 0
     wrong = Path(tmp_path / "result")

@@ -1,4 +1,4 @@
-"""The results page: one offline file, true to the records, with pictures, failures and sweeps; and its charts."""
+"""The HTML report: one offline file with the records' numbers, images, failures and sweeps; and its charts."""
 
 import base64
 import io
@@ -25,13 +25,13 @@ from short import short, shorten
 from tiny import FILTER, SCENARIO, SMOOTHING, git_says, record, write_baseline
 
 EVIL = "Evil <script>alert('x')</script> & \\\"co\\\""
-"""A title as it stands in a docstring; the page must show it and not run it."""
+"""A title with HTML; the page must escape it."""
 TANK = Environment("eitbench/StationaryTank2D-v0", json.dumps(short("eitbench/StationaryTank2D-v0")))
 
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory):
-    """A folder with results of short pipes and a tank, one method failing; its records, and its page."""
+    """Return a folder with results of short pipes and a tank, one method failing; its records, and its page."""
     folder = tmp_path_factory.mktemp("page")
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv(CACHE_VARIABLE, str(folder / "cache"))
@@ -51,7 +51,7 @@ def made(tmp_path_factory):
 
 
 def test_the_page_needs_nothing_else(made):
-    """Every address is data or within the page; titles, messages and commands are text."""
+    """Every address is data or within the page; titles, messages and commands are escaped."""
     html = made[2]
     parsed = Page(html)
     assert not {tag for tag, _ in parsed.tags} & {"iframe", "object", "embed", "base"}
@@ -63,7 +63,7 @@ def test_the_page_needs_nothing_else(made):
 
 
 def test_each_environment_has_a_section(made):
-    """Its title, scores of each method, charts over its own steps, failures with the user's lines, and provenance."""
+    """A leaderboard has title, scores of each method, charts over time, failures with the user's lines, provenance."""
     _, records, html = made
     sections = re.findall(r'<section id="board-.*?</section>', html, flags=re.DOTALL)
     names = [re.search(r"<h2>(.*?)</h2>", section)[1] for section in sections]
@@ -81,7 +81,7 @@ def test_each_environment_has_a_section(made):
 
 
 def test_pictures_show_truth_and_estimates(made):
-    """PNG data with alternative texts; long pipes with a flow, round tanks without one."""
+    """Images are PNG data with alternative texts: long pipes with a flow, round tanks without."""
     sections = re.findall(r'<section id="board-.*?</section>', made[2], flags=re.DOTALL)
     for section, times, ratio in zip(sections, (2, 2, 3), (4.0, 4.0, 1.0), strict=True):
         images = [attributes for tag, attributes in Page(section).tags if tag == "img"]
@@ -90,12 +90,12 @@ def test_pictures_show_truth_and_estimates(made):
         picture = np.asarray(Image.open(io.BytesIO(base64.b64decode(content, validate=True))))
         assert kind == "data:image/png;base64" and np.ptp(picture[..., :3].astype(int), axis=(0, 1)).max() > 20
         assert picture.shape[1] / picture.shape[0] == pytest.approx(ratio, rel=0.03)
-        assert (picture[0, 0, 3] == 0) == (ratio == 1.0)               # a disc leaves the corners free
+        assert (picture[0, 0, 3] == 0) == (ratio == 1.0)               # the corners outside a disc are empty
         assert ("flow from left to right" in section) == (ratio == 4.0)
 
 
 def test_a_page_of_failures_or_without_estimates(made, tmp_path):
-    """Where only the records were kept, all but the pictures is drawn."""
+    """A page from records alone has everything except images."""
     _, records, _ = made
     failed = [each for each in records if each["method"] == "surely_failing"]
     html = page.write_page(EpisodeStore(tmp_path), run_leaderboards(failed)).read_text(encoding="utf-8")
@@ -119,7 +119,7 @@ def test_a_sweep_is_on_the_page(tmp_path):
 
 
 def test_a_round_pipe_is_cut_along_its_axis():
-    """In 3D the picture is as long as the pipe and as high as it is wide, and shows what changes along it."""
+    """The image of a 3D pipe is the section along the pipe, with its length and width."""
     mesh = extrude(uniform_disc(0.05, 4), np.linspace(0.0, 0.4, 5))
     task = SimpleNamespace(mesh=mesh, expected_concentration=1.0, vessel=PIPE_3D.vessel)
     assert page._size(task) == "40 cm long, 10 cm across, cut along the axis; flow from left to right"
@@ -135,7 +135,7 @@ def test_a_round_pipe_is_cut_along_its_axis():
 
 @pytest.mark.parametrize("values", [[0.1], [0.1, 0.1], [0.2, 0.0, 0.3]], ids=["one step", "constant", "a zero"])
 def test_odd_values_can_be_drawn(values):
-    """One step, no change and a perfect estimate are within the picture, in curves and marks."""
+    """One step, no change and a perfect estimate are within the chart, as curves and marks."""
     series = [charts.Series("mine", 0, np.array(values))]
     points = [charts.ParetoPoint("p", 0, value, value) for value in values]
     for drawn in (charts.line_chart(np.arange(1, 1 + len(values)), series, "step", "error"),
@@ -149,7 +149,7 @@ def test_odd_values_can_be_drawn(values):
 
 
 def test_the_front_has_the_methods_that_no_other_beats():
-    """Fast and poor, slow and good; neither the dominated nor the floor, however fast."""
+    """The front has fast inaccurate and slow accurate methods, without dominated ones and the naive baseline."""
     points = [charts.ParetoPoint(name, i, x, y, competes) for i, (name, x, y, competes) in enumerate([
         ("good", 9.0, 1.0, True), ("fast", 1.0, 5.0, True), ("beaten", 9.0, 5.0, True), ("between", 3.0, 2.0, True),
         ("same time, worse", 1.0, 6.0, True), ("floor", 0.1, 0.5, False)])]

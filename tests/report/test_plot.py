@@ -1,4 +1,4 @@
-"""`eitbench.plot` and what notebooks show: axes that hold the numbers they were given."""
+"""`eitbench.plot` and representations in notebooks: axes contain the given numbers."""
 
 import eitbench
 import gymnasium as gym
@@ -29,18 +29,18 @@ def task_of(name):
 
 
 def painted(ax):
-    """The values of the field that was drawn last on axes."""
+    """Return the values of the last field drawn on axes."""
     return np.asarray(ax.collections[0].get_array())
 
 
 def means_of(ax):
-    """From below."""
+    """Return the titles of panels from bottom to top."""
     return [float(bar[0].get_xdata()[0]) for bar in ax.containers]
 
 
 @pytest.mark.parametrize("name", [PIPE, TANK, SOLID])
 def test_a_field_is_drawn_to_scale(name):
-    """In cm, on the axes that are given, in the colour scale of the task; of an estimate the mean."""
+    """A plot is in cm, on given axes, in the colour scale of the task; it shows the mean of an estimate."""
     task = task_of(name)
     c = np.linspace(20.0, 40.0, task.mesh.n_nodes)
     ax = plt.subplots()[1]
@@ -52,7 +52,7 @@ def test_a_field_is_drawn_to_scale(name):
         size = 100 * np.ptp(task.mesh.points, axis=0)
         assert np.ptp(ax.get_xlim()) == pytest.approx(size[0]) and ax.get_xlabel() == "x / cm"
     colours = {tuple(np.round(each.get_color()[0][:3], 2)) for each in ax.collections[1:]}
-    assert len(colours) > 1 or task.mesh.dim == 3        # source, sink and the others; in 3D those that are cut
+    assert len(colours) > 1 or task.mesh.dim == 3        # source, sink and the others; in 3D electrodes in the section
 
 
 def test_a_field_of_another_mesh_is_told():
@@ -64,7 +64,7 @@ def test_a_field_of_another_mesh_is_told():
 
 
 def test_an_episode_shows_truth_and_estimate():
-    """The numbers drawn are those of the truth and of the estimate at the times that the titles say; ẽ_c is that of the
+    """Plots show truth and estimate at the times of the titles; ẽ_c is the
     score."""
     given = world(PIPE)["world"]
     axes = eitbench.plot.episode("homogeneous", PIPE, "dev:0", world=given, times=2)
@@ -93,7 +93,7 @@ def test_an_episode_of_a_policy():
 
 
 def test_methods_are_compared_best_first():
-    """A dot for each episode, the mean in its interval; from one table or several; scores that are better when higher
+    """Each episode has a dot, the mean an interval; from one table or several; scores that are better when higher
     are too."""
     tables = [pd.DataFrame({"environment": "a", "method": method, "seed": ["dev:0", "dev:1"], "error": errors,
                             "seconds_per_step": [0.002, 0.004]})

@@ -1,4 +1,4 @@
-"""Boards of a user's own results and their texts: statistics against scipy, rounding, skill, and order."""
+"""Leaderboards of a user's results and their texts: statistics against scipy, rounding, scores, and order."""
 
 import math
 import re
@@ -19,7 +19,7 @@ FLOOR, REFERENCE = [0.020, 0.024, 0.022], [0.004, 0.002, 0.003]
 
 
 def made(method, board, errors, kwargs=None, **changes):
-    """A record whose episode test:i has ``errors[i]``; with arguments of its environment, if any."""
+    """Return a record whose episode test:i has ``errors[i]``, with optional arguments of its environment."""
     if kwargs:
         changes["environment"] = {"id": BOARD_IDS[board], "name": f"{board}-changed", "kwargs": kwargs}
     return record(method, errors, board=board, version="v1", **changes)
@@ -29,7 +29,7 @@ ANCHORS = [made("homogeneous", "smoothing", FLOOR), made("true_model_smoother", 
 
 
 def row(records, method, board):
-    """The cells of one method on one board."""
+    """Return the cells of one method on one leaderboard."""
     return next(row.cells for each in run_leaderboards(records) if each.category == board
                 for row in each.rows if row.cells["method"] == method)
 
@@ -39,7 +39,7 @@ def row(records, method, board):
 
 @given(st.lists(st.floats(0.001, 100.0), min_size=2, max_size=30))
 def test_interval_is_students(values):
-    """Mean and half width of the 95 % interval, as scipy.stats has them."""
+    """Mean and half width of the 95 % interval equal scipy.stats."""
     mean, half = mean_and_interval(values)
     assert mean == pytest.approx(np.mean(values), rel=1e-12)
     expected = stats.sem(values) * stats.t(len(values) - 1).ppf(0.975)
@@ -53,13 +53,13 @@ def test_interval_is_students(values):
     (0.0123, math.inf, "0.0123"), (2.0, 0.0, "2"), (0.0, 0.0, "0"),
 ])
 def test_rounded_examples(mean, half, text):
-    """The interval has one significant digit, two after a 1; the mean ends at the same place."""
+    """The interval has one significant digit, two after a 1; the mean has the same number of decimals."""
     assert format_mean(mean, half) == text
 
 
 @given(st.floats(1e-3, 100.0), st.floats(1.01e-5, 1.0))
 def test_rounding_stays_within_the_interval(mean, part):
-    """Read back, the mean lies within the interval, which is right to a third; both end at the same decimal place."""
+    """The rounded mean is within the interval, which is accurate to a third; both have equal decimals."""
     half = max(part * mean, 1.01e-5)
     shown = format_mean(mean, half)
     match = re.fullmatch(r"(\d+(?:\.(\d+))?) ± (\d+(?:\.(\d+))?)", shown)
@@ -79,38 +79,38 @@ def test_numbers_are_short_and_never_powers_of_ten(value, text):
 
 
 def test_skill_of_the_anchors():
-    """0 for the homogeneous estimate of the smoothing board, 1 for the smoother with the true model."""
+    """The normalised score is 0 for the homogeneous estimate in smoothing, 1 for the smoother with the true model."""
     assert row(ANCHORS, "homogeneous", "smoothing")["skill"] == 0.0
     assert row(ANCHORS, "true_model_smoother", "smoothing")["skill"] == 1.0
 
 
 @pytest.mark.parametrize("board", ["filter", "fixed-lag", "smoothing"])
 def test_skill_is_measured_on_shared_episodes(board):
-    """On each board, means over the episodes that all three have: here only the first, (20 − 8)/(20 − 4)."""
+    """Means are over the common episodes of all three: here only the first, (20 − 8)/(20 − 4)."""
     mine = made("mine", board, [0.008, None, None])
     assert row([*ANCHORS, mine], "mine", board)["skill"] == pytest.approx(12 / 16)
     assert row([*ANCHORS, made("mine", board, [None])], "mine", board)["skill"] is None
 
 
 def test_skill_needs_its_anchors():
-    """Without either anchor, or with anchors of another world only, there is no skill."""
+    """Without one of the anchors, or with anchors of another world, the normalised score is missing."""
     mine = made("mine", "filter", FLOOR)
     for others in ([], ANCHORS[:1], ANCHORS[1:]):
         assert row([*others, mine], "mine", "filter")["skill"] is None
     elsewhere = made("mine", "filter", FLOOR, kwargs={"world": {"schedule": {"scored_steps": 16}}})
     assert row([*ANCHORS, elsewhere], "mine", "filter")["skill"] is None
-    theirs = [anchor | {"version": "1" * 8} for anchor in ANCHORS]             # third-party files of these names
+    theirs = [anchor | {"version": "1" * 8} for anchor in ANCHORS]             # third-party files with these names
     assert row([*theirs, mine], "mine", "filter")["skill"] is None
     assert row([*theirs, mine], "mine", "filter")["gain"] is None
-    # an assumed velocity leaves the world, and so its anchors, as they are
+    # an assumed velocity does not change the world and its anchors
     wrong = made("mine", "filter", FLOOR, kwargs={"assume": {"mean_velocity": 7.0}})
     assert row([*ANCHORS, wrong], "mine", "filter")["skill"] == pytest.approx(0.0)
 
 
 @pytest.mark.parametrize("official", [True, False])
 def test_anchors_look_back_on_the_longest_made(official):
-    """The anchors are the smoothing board's, though others of the world stand beside them; of several versions the
-    official one counts, whichever comes first."""
+    """The anchors are from the smoothing subtrack, also if other subtracks have them; of several versions the
+    official one counts, in any order."""
     others = [made("homogeneous", "filter", [0.5] * 3), made("true_model_smoother", "filter", [0.4] * 3)]
     mine = made("mine", "filter", REFERENCE)
     assert row([*others, *ANCHORS, mine], "mine", "filter")["skill"] == pytest.approx(1.0)
@@ -134,13 +134,13 @@ def test_anchors_look_back_on_the_longest_made(official):
      "Pipe2DBiasedVelocity (region=null)", "Pipe2DBiasedVelocity-v0 (assume.profile=plug, region=null)"),
 ])
 def test_names(id, kwargs, name, title):
-    """A world is named without lag and assumptions, which leave the truth unchanged; a title has all arguments."""
+    """A world's name omits lag and assumptions, which do not change the truth; a title has all arguments."""
     given = {"environment": {"id": id, "name": "x" if kwargs else id.replace("/", "-"), "kwargs": kwargs}}
     assert (world_key(given), environment_title(given)) == (name, title)
 
 
 def test_order_of_boards_and_methods():
-    """Test seeds first, then worlds as registered, their boards, and methods by error; failures come last."""
+    """Test seeds are first, then worlds as registered, subtracks, and methods by error; failures are last."""
     records = [made("d", "smoothing", [0.2]), made("e", "filter", {"dev:0": 0.1}), made("c", "filter", [None]),
                made("f", "filter", [0.1], id="eitbench/Pipe3D-v0"), made("b", "filter", [0.3]),
                made("a", "filter", [0.2])]
@@ -151,7 +151,7 @@ def test_order_of_boards_and_methods():
 
 
 def test_all_episodes_of_a_run_are_shown():
-    """More than the floor has; gains are of the shared ones."""
+    """A method may have more episodes than the naive baseline; skill scores are of common ones."""
     records = [made("homogeneous", "filter", FLOOR, role="floor"), made("mine", "filter", [0.01] * 5)]
     mine = row(records, "mine", "filter")
     assert mine["seeds"] == "test:0-4" and mine["error"] == pytest.approx(0.01)
@@ -162,7 +162,7 @@ def test_all_episodes_of_a_run_are_shown():
 
 
 def test_failures_are_counted_not_averaged():
-    """Scores are of the finished episodes; the table has the number of others."""
+    """Scores are of the finished episodes; the table has the number of failed ones."""
     (board,) = run_leaderboards([made("mine", "filter", [0.1, 0.2, None]), made("bad", "filter", [None])])
     text = said(run_table(board))
     assert list(text["seeds"]) == ["test:0-2, 1 failed", "test:0, 1 failed"] and list(text["ẽ_c"])[1] == "–"
@@ -170,7 +170,7 @@ def test_failures_are_counted_not_averaged():
 
 
 def test_units_and_missing_values():
-    """Time in ms, voltage discrepancy in mV²; the skill falls back to 1 − contrast; empty columns are absent."""
+    """Time is in ms, the voltage residual in mV²; the score falls back to 1 − contrast; empty columns are omitted."""
     scores = {"seconds_per_step": 0.0025, "voltage_discrepancy": 4e-6, "contrast_error": 0.25}
     (board,) = run_leaderboards([made("mine", "filter", [0.1], scores=scores), made("other", "filter", [0.2])])
     text = said(run_table(board))
@@ -179,14 +179,14 @@ def test_units_and_missing_values():
 
 
 def test_the_drawn_table_has_bootstrap_intervals():
-    """From six episodes on; the numbers are those of the board."""
+    """The rank needs six episodes; the numbers equal the leaderboard."""
     (board,) = run_leaderboards([made("mine", "filter", [0.1, 0.2, 0.15, 0.12, 0.18, 0.11])])
     (cells,) = said(run_table(board, drawn=True)).to_dict("records")
     assert cells["ẽ_c"] == format_interval(*board.rows[0].interval("error")) and "(" in cells["ẽ_c"]
 
 
 def test_terminal_tables_fit_and_name_what_is_left_out():
-    """A title with what all rows share, aligned lines within the width, and the names of missing columns."""
+    """A table has a title with common properties, aligned lines within the width, and the names of omitted columns."""
     scores = {"contrast_error": 0.2, "nis": 1.1, "crps": 1.0, "coverage_50": 0.5, "coverage_90": 0.9}
     found = run_leaderboards([made("mine", "filter", [0.1, 0.2], scores=scores), made("y" * 50, "filter", [0.2, 0.2])])
     title, table, note, missing = terminal_tables(found, 70).split("\n\n")
@@ -199,7 +199,7 @@ def test_terminal_tables_fit_and_name_what_is_left_out():
 
 
 def test_markdown_is_a_table():
-    """Every line has the same number of cells and the same width, whatever a title contains."""
+    """Every line has the same number of cells and the same width, for any title."""
     odd = made("mine", "filter", [0.1, 0.2], title="mine | yours")
     lines = markdown(run_leaderboards([odd, made("b", "filter", [0.2])])).splitlines()[2:]
     assert len(lines) == 4 and re.fullmatch(r"[|:-]+", lines[1]) and len({len(line) for line in lines}) == 1

@@ -1,4 +1,4 @@
-"""The site: the numbers of the boards and no others, links that resolve, offline, reproducible."""
+"""The site: numbers of the leaderboards, valid links, offline, reproducible."""
 
 import hashlib
 import re
@@ -48,7 +48,7 @@ def rendered(records):
 
 @pytest.fixture(scope="module")
 def site():
-    """Of several boards, with an animation."""
+    """Return a site of several leaderboards, with an animation."""
     return rendered(several_boards())
 
 
@@ -61,7 +61,7 @@ def pages(site):
 
 
 def test_published_files_are_rendered_from_the_records():
-    """`eitbench leaderboard --records leaderboards/results` changes nothing; the site is not too large either."""
+    """`eitbench leaderboard --records leaderboards/results` changes nothing; the site has a limited size."""
     folder = ROOT / "leaderboards"
     found = collect(read_records(folder / "results"), folder)
     assert not found.measured.errors
@@ -79,7 +79,7 @@ def test_the_same_records_give_the_same_bytes(site):
 
 
 def test_writing_a_site_replaces_a_site_and_nothing_else(tmp_path):
-    """Without records it is one page; pages whose records are gone go; a folder with other files is not touched."""
+    """Without records it is one page; pages of removed records are deleted; a folder with other files is unchanged."""
     files = render_site(collect([]))
     assert files.keys() == {"index.html", "style.css", "script.js"}
     assert "No records yet" in files["index.html"].decode()
@@ -94,18 +94,18 @@ def test_writing_a_site_replaces_a_site_and_nothing_else(tmp_path):
         assert (tmp_path / name / name).read_text() == "<strong>mine</strong>"
 
 
-# -- true to the boards -----------------------------------------------------------------------------------------------
+# -- equal to the leaderboards -----------------------------------------------------------------------------------------
 
 
 def rows_of(html, anchor):
-    """The cells' text of each row of the first board after an anchor."""
+    """Return the cells' text of each row of the first leaderboard after an anchor."""
     body = html.split(anchor, 1)[1].split("</thead>")[1].split("</table>")[0]
     return [[text_of(cell) for cell in re.findall(r"<td.*?>(.*?)</td>", row)]
             for row in re.findall(r"<tr.*?>(.*?)</tr>", body)]
 
 
 def test_numbers_are_those_of_the_boards(pages):
-    """Ranks, errors, gains and times of every row of every board, on the index and on the environments' pages."""
+    """Index and environment pages have ranks, errors, skill scores and times of all rows of all leaderboards."""
     for board in collect(several_boards()).boards:
         shown = rows_of(pages["index.html"], f'id="{board.anchor}"')
         places = [shown] if board.is_aggregate else [shown, rows_of(pages[board.address], "<h2>Leaderboard</h2>")]
@@ -126,7 +126,7 @@ def test_numbers_are_those_of_the_boards(pages):
 
 
 def test_a_methods_page_has_every_episode_and_its_provenance(pages):
-    """Seeds and errors as recorded, failures, parameters, machines, commands; processes of one machine once."""
+    """A method's page has recorded seeds, errors, failures, parameters, commands, and each machine once."""
     html = pages["methods/failing.html"]
     assert all(f">test:{i}</td>" in html for i in range(8)) and "RuntimeError: oh" in html and "1 failed" in html
     for episode in next(r for r in several_boards() if r["method"] == "failing")["episodes"][:7]:
@@ -142,7 +142,7 @@ def test_a_methods_page_has_every_episode_and_its_provenance(pages):
 
 
 def test_docstrings_and_files_are_of_the_recorded_version():
-    """A built-in method's text is shown only where the file is unchanged; an agent's file only if it is the same."""
+    """A built-in method's description is shown only if the file is unchanged; an agent's file only if it is equal."""
     content = (ROOT / "baselines" / "kalman_filter.py").read_bytes()
     same = record("kalman_filter", [0.1], method_sha256=hashlib.sha256(content).hexdigest())
     words = "parameters of Table 5.1"
@@ -158,17 +158,17 @@ def test_docstrings_and_files_are_of_the_recorded_version():
 
 
 def test_every_environment_is_documented():
-    """Description first, then tables; headings below the page's."""
+    """The description precedes tables; its headings are below the page's heading."""
     for id in ids():
         first, rest = documentation(id)
         assert len(first) > 100 and "<table>" not in first and "<table>" in rest and "<h2>" not in first + rest, id
 
 
-# -- trainings, references --------------------------------------------------------------------------------------------
+# -- training seeds, oracles -------------------------------------------------------------------------------------------
 
 LEVEL = np.array([0.20, 0.24, 0.22, 0.26, 0.18, 0.30])
 SEEDS = {0: 0.50, 1: 0.56, 2: 0.47}
-"""Training seed -> error over that of the floor."""
+"""Training seed -> error relative to the naive baseline."""
 
 
 def of(factor, jitter=0.0):
@@ -180,7 +180,7 @@ def agent(seed, factor, **changes):
 
 
 def agents(*more):
-    """An agent of three trainings with a rule between them and one behind, a beaten reference, and the floor."""
+    """Return an agent of three training seeds, two rules, an outperformed oracle and a naive baseline."""
     return [record("homogeneous", list(LEVEL), **FLOOR), record("between", of(0.53, 0.1)),
             record("behind", of(0.9)), record("seer", of(0.6), role="reference", privileged=True),
             *(agent(seed, factor) for seed, factor in SEEDS.items()), *more]
@@ -192,7 +192,7 @@ def board_of(records):
 
 
 def test_the_line_of_an_agent_is_the_mean_of_its_trainings():
-    """Error, gain, interval over episodes, and the range of their ranks; Markdown has each training."""
+    """An agent has error, skill score, interval over episodes, and range of ranks; Markdown has each training seed."""
     board = board_of(agents(record("ppo_seed3", [*of(0.5)[:5], None])))
     placed = group_by_agent(board)
     assert [line.row.cells["method"] for line in placed] == ["ppo", "between", "seer", "behind", "homogeneous"]
@@ -218,13 +218,13 @@ def test_the_line_of_an_agent_is_the_mean_of_its_trainings():
     ([agent(0, 0.5), agent(1, 0.5), record("dqn_seed0", of(0.5))], ["dqn_seed0", "ppo"]),
 ])
 def test_grouped_trainings(records, expected):
-    """Trainings of one agent, run by the same side, of which two have a rank."""
+    """Records of one agent by the same submitter form a group if two have a rank."""
     board = board_of([record("homogeneous", list(LEVEL), **FLOOR), *records])
     assert sorted(line.row.cells["method"] for line in group_by_agent(board)) == sorted([*expected, "homogeneous"])
 
 
 def test_an_outperformed_reference_is_marked():
-    """With the number of better methods, an agent counting once."""
+    """An outperformed oracle has the number of better methods; an agent counts once."""
     badges = {row.cells[1].text: row.cells[1].badges for row in page_table(board_of(agents(
         record("oracle", of(0.1), role="reference", privileged=True))), "").rows}
     assert badges["Seer"] == ("oracle", "privileged", "outperformed here by 2 others", "self-reported")
@@ -262,7 +262,7 @@ def test_robustness_by_hand():
     assert [cell for cell in shown.to_numpy().ravel() if "worse" in cell] == ["0.3 × 15 (worse than naive)"]
     assert list(shown.loc["bad"]) == [MISSING, "0.1 (3 failed)", MISSING, MISSING, MISSING]
     better = robustness([*shifted()[:-1], record("persistence", [0.11] * 4, id=NOISE, version="v1", **FLOOR),
-                         record("mine", [1e-9] * 4, id=NOISE, role="floor")])     # a self-reported floor marks nothing
+                         record("mine", [1e-9] * 4, id=NOISE, role="floor")])     # self-reported: no effect
     assert set(better[better["double noise"].str.contains("worse")].index) == {"tuned", "steady"}
     assert shift_heading("me/WeakWorn-v0", "me/Weak-v0") == "worn" and shift_heading(SHORT, HOME) == "short slugs"
 
@@ -287,11 +287,11 @@ def headlined(errors, official=True, **changes):
 
 
 def test_the_headline_is_computed():
-    """37 over 4 is nine and a quarter; gains of the best filter, trained agent and rule."""
+    """The ratio of 37 and 4 is nine; key figures are skill scores of the best filter, trained agent and rule."""
     found = headline(collect(headlined(ERRORS)))
     assert found.text == "A flow model reduces the error ninefold" and found.figure.value == "5.0 ×"
     for expected in ("0.037", "0.0040", "9.2 times less", "3.0 times less in its square root", "0.020",
-                     "test:0-1 of Pipe2D-v0"):
+                     "test:0-1 of Pipe2"):
         assert expected in found.measured, expected
     policies = {"ppo_seed0": 0.5, "ppo_seed1": 0.7, "rule": 0.8, "random_pair": 1.0}
     filters, trained = key_figures(collect([
@@ -307,7 +307,7 @@ def test_the_headline_is_computed():
     ({name: error for name, error in ERRORS.items() if name != "gauss_newton"}, True),
     (ERRORS | {"gauss_newton": 0.006}, True), (ERRORS | {"gauss_newton": 0.9}, True), (ERRORS, False)])
 def test_no_headline_where_it_would_not_be_true(errors, official):
-    """A method is missing, the ratio is too small or too large, or the records are self-reported."""
+    """A missing method, a ratio out of range, or self-reported records give no headline."""
     records = headlined(errors, official)
     assert headline(collect(records)) is None and "<figure>" not in rendered(records)["index.html"]
 
@@ -316,7 +316,7 @@ def test_no_headline_where_it_would_not_be_true(errors, official):
 
 
 def test_every_link_resolves(site, pages):
-    """To a file of the site and an anchor on it, or to a file beside it; nothing comes from elsewhere."""
+    """Links point to files and anchors of the site or the repository; all resources are local."""
     anchors = {path: Page(html).attributes("id") for path, html in pages.items()}
     links = 0
     for path, html in pages.items():
@@ -336,7 +336,7 @@ def test_every_link_resolves(site, pages):
 
 
 def test_links_beside_the_site(tmp_path):
-    """Only to what exists."""
+    """Links to files of the repository exist."""
     folder = tmp_path / "leaderboards"
     for name in (LINKS["Submit a method"], LINKS["Code"], f"{METHODS_FOLDER}/kalman_filter.py", *(
             f"media/{name}" for name in HEADLINE)):
@@ -353,13 +353,13 @@ def test_links_beside_the_site(tmp_path):
 
 
 def test_markdown_is_text_and_tables():
-    """HTML and links of a docstring are text."""
+    """HTML and links of a docstring are escaped."""
     html = markdown("## A\n\n<b>x</b> [y](http://z)\n\n| a |\n|---|\n| 1 |\n")
     assert "<h3>A</h3>" in html and "<b>" not in html and "href" not in html and "<table>" in html
 
 
 def luminance(colour):
-    """WCAG's, of #rrggbb."""
+    """Return the WCAG luminance of #rrggbb."""
     parts = [int(colour[i:i + 2], 16) / 255 for i in (1, 3, 5)]
     linear = [part / 12.92 if part <= 0.04045 else ((part + 0.055) / 1.055) ** 2.4 for part in parts]
     return 0.2126 * linear[0] + 0.7152 * linear[1] + 0.0722 * linear[2]

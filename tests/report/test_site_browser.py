@@ -1,7 +1,7 @@
 """The site in a real browser: sorting, filtering, following a link, the theme, and a phone's width.
 
-Chromium opens a page with a frame of the wanted width; a script around the frame acts on the site inside and
-leaves its answer as JSON. Clicks and keys are events of that script.
+Chromium opens a page with a frame of the given width; a script around the frame acts on the site inside and
+returns its result as JSON. Clicks and keys are events of that script.
 """
 
 import html
@@ -22,10 +22,10 @@ from tiny import record, several_boards
 
 CHROMIUM = next(filter(None, map(shutil.which, (
     "chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "chrome"))), None)
-pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="there is no Chromium or Chrome on the PATH")
+pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="Chromium and Chrome are not on the PATH")
 BOARD, AGENTS = "#board-filter-eitbench-Pipe2D-v0", "#board-injection-eitbench-Pipe2DInjection-v0"
 ENVIRONMENT, METHOD = "environments/eitbench-Pipe2D-v0.html", "methods/a.html"
-"""One page of each kind, beside the index."""
+"""One page of each kind, besides the index."""
 DARK = "--blink-settings=preferredColorScheme=0"
 STILL = "--force-prefers-reduced-motion"
 HARNESS = """<body><iframe id="frame" style="width: {width}px; height: 900px; border: 0"></iframe><script>
@@ -53,7 +53,7 @@ const open = (address) => new Promise((resolve) => {{
 
 
 def answer(page, script, *flags, width=1200, scripts=True):
-    """The JSON-ready value that a script returns of a page in a frame; errors in the page's console fail."""
+    """Return the JSON-ready result of a script on a page in a frame; errors in the page's console fail."""
     harness = page.with_name("harness.html")
     harness.write_text(HARNESS.format(width=width, scripts=json.dumps(scripts), page=json.dumps(page.as_uri()),
                                       script=script), encoding="utf-8")
@@ -72,7 +72,7 @@ def answer(page, script, *flags, width=1200, scripts=True):
 
 
 def widest():
-    """Records with every score of an estimator, and the anchors of its skill."""
+    """Return records with all scores of an estimator, and the anchors of its normalised score."""
     scores = {"contrast_error": 2.28, "nis": 1.44, "crps": 0.98, "velocity_error": 2.3e-32, "coverage_50": 0.58,
               "coverage_90": 0.88, "spread_ratio": 1.44, "voltage_discrepancy": 1e-4, "seconds_per_step": 0.465}
     errors = {"homogeneous": 0.0213, "true_model_smoother": 0.0027, "extended_kalman_filter": 0.0048}
@@ -94,7 +94,7 @@ def folder(tmp_path_factory):
 
 
 def test_sort_by_columns(folder):
-    """Up, down, and up again by another column; rows without a value stay last; aria-sort names the order."""
+    """Tables sort up, down, and by another column; rows without a value stay last; aria-sort names the order."""
     found = answer(folder / "index.html", f"""
         const cells = (k) => shown("{BOARD} tbody tr").map((row) => row.cells[k].textContent.trim());
         const sorts = () => all("{BOARD} th").map((cell) => cell.ariaSort).filter(Boolean);
@@ -114,7 +114,7 @@ def test_sort_by_columns(folder):
 
 
 def test_filter_by_words_and_by_kind(folder):
-    """Words select methods and environments; each box hides one kind; the count says how many lines are left."""
+    """Text filters methods and environments; each box hides one kind; a count shows the remaining rows."""
     found = answer(folder / "index.html", f"""
         const names = () => shown("{BOARD} tbody tr").map((row) => row.cells[1].textContent);
         const every = names().length;
@@ -166,7 +166,7 @@ def test_nothing_overflows(folder, page, width):
 
 
 def test_headings_explain_themselves(folder):
-    """To the pointer and to the keyboard; Escape closes the explanation."""
+    """Column descriptions open by pointer and keyboard; Escape closes them."""
     tips = answer(folder / "index.html", f"""
         const header = one("{BOARD} thead th:nth-child(4)"), button = header.querySelector("button");
         const tip = () => one(".tip:popover-open")?.textContent ?? null;
@@ -184,7 +184,7 @@ def test_headings_explain_themselves(folder):
 
 @pytest.mark.parametrize("scripts", [True, False], ids=["with scripts", "without"])
 def test_trainings_open(folder, scripts):
-    """Also where no script runs; they are sorted and found as one line."""
+    """Training seeds expand without scripts too; they are sorted and filtered as one row."""
     script = f"""
         const parts = () => shown("{AGENTS} tr.part").length, before = parts();
         one("{AGENTS} summary").click();
@@ -204,7 +204,7 @@ def test_trainings_open(folder, scripts):
 
 @pytest.mark.parametrize(("flags", "first"), [((), 0), ((STILL,), 1)], ids=["moving", "still"])
 def test_the_picture_can_be_stopped(flags, first, tmp_path):
-    """By a button; it is still where the system prefers less motion."""
+    """A button pauses the animation; it is paused if the system prefers reduced motion."""
     records = [record(name, [error] * 2, official=True, version="v1") for name, error in (
         ("homogeneous", 0.02), ("gauss_newton", 0.037), ("extended_kalman_filter", 0.004))]
     (tmp_path / "media").mkdir()
@@ -222,7 +222,7 @@ def test_the_picture_can_be_stopped(flags, first, tmp_path):
 
 @pytest.mark.parametrize("width", [390, 1280])
 def test_the_results_page_fits(tmp_path, width):
-    """Sortable and without overflow, as the site."""
+    """The HTML report is sortable and without overflow, like the site."""
     path = write_page(EpisodeStore(tmp_path), run_leaderboards(widest()))
     assert answer(path, """
         one("thead th:nth-child(2) button").click();

@@ -1,4 +1,4 @@
-"""A vessel from mesh files: the same physics as one that is built, and clear words for what is missing."""
+"""A vessel from mesh files: the same physics as a built-in vessel, and errors for missing groups."""
 
 import hashlib
 
@@ -27,7 +27,7 @@ class RoundMeshVessel(MeshVessel):
 
 @pytest.fixture(scope="module")
 def files(tmp_path_factory):
-    """Path and hash of a fine and a coarse mesh of the round tank, and the meshes themselves."""
+    """Return paths, hashes and meshes of a fine and a coarse discretisation of the round tank."""
     folder = tmp_path_factory.mktemp("meshes")
     made = {}
     for name, size in (("fine", (4, 10)), ("coarse", (2, 6))):
@@ -57,7 +57,7 @@ def test_electrodes_are_those_of_the_groups(files, vessel):
 
 
 def test_a_world_of_it_is_played(vessel, monkeypatch):
-    """A script registers it, and it runs as any other id; without an inlet there is no inflow."""
+    """A script can register it, and it runs like other ids; without an inlet it has no inflow."""
     register_apart(monkeypatch)
     world = World("Meshed", vessel, NoFlow(), Cylinders(), schedule=Schedule(
         time_step=0.02, scored_steps=4, pattern=TankOppositeDiagonalPattern(), warm_up=0, calibration=1))
@@ -72,7 +72,7 @@ def test_a_world_of_it_is_played(vessel, monkeypatch):
 
 
 def test_another_file_is_refused(files, vessel):
-    """The world names the file by its hash; a group that is missing is named."""
+    """The world identifies the file by its hash; a missing group is named."""
     changed = RoundMeshVessel(files["fine"][0], "0" * 64, *files["coarse"][:2], 8)
     with pytest.raises(ValueError, match=r"fine\.msh: must be the file with SHA-256 0000"):
         changed.transport_mesh(True)

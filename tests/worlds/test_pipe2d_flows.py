@@ -18,18 +18,18 @@ each_unknown = pytest.mark.parametrize("world", WORLDS[1:], ids=lambda world: wo
 
 
 def drawn(world, seed):
-    """The flow of an episode."""
+    """Return the flow of an episode."""
     return world.flow.draw(world, episode_streams(seed).flow)
 
 
 def mean_velocities(world, seeds):
-    """v̄ of the first time step in each of these episodes."""
+    """Return v̄ of the first time step in each of these episodes."""
     return np.array([drawn(world, seed)(1).mean_velocity for seed in seeds])
 
 
 @each_world
 def test_mean_velocity_is_drawn_evenly_from_its_range(world):
-    """A uniform distribution between its ends; about its mean where it swings, so there without the swing."""
+    """The mean velocity is uniform within its range, apart from the oscillation."""
     steady = world.with_changes({"flow": {"oscillation_range": [0.0, 0.0]}})
     low, high = steady.flow.velocity_range
     means = mean_velocities(steady, range(400))
@@ -38,8 +38,8 @@ def test_mean_velocity_is_drawn_evenly_from_its_range(world):
 
 
 def test_estimators_are_told_another_velocity():
-    """Their model moves a ramp along the axis by 1.5·v̄ a second, v̄ being what they are told, but
-    not what was drawn."""
+    """The estimator model moves a ramp along the axis by 1.5·v̄ per second with the specified v̄,
+    not the drawn one."""
     for assumed, mean in (({}, 4.5), ({"mean_velocity": 2.0}, 2.0)):
         transport = PIPE_2D_BIASED.estimator_model(**assumed).transport
         points = transport.mesh.points
@@ -52,10 +52,10 @@ def test_estimators_are_told_another_velocity():
 
 @pytest.mark.parametrize("seed", range(4))
 def test_mean_velocity_swings_as_a_sine(seed):
-    """v̄(t) is a constant and one sine, of an amplitude and a period within their ranges, found by least squares."""
+    """A least-squares fit finds v̄(t) as a constant plus a sine, with amplitude and period within their ranges."""
     world = PIPE_2D_TIME_VARYING
     flow = drawn(world, seed)
-    steps = np.arange(1, 801)                           # four seconds: five periods and more
+    steps = np.arange(1, 801)                           # four seconds: at least five periods
     mean = np.array([flow(t).mean_velocity for t in steps])
     time = (steps - 0.5) * world.time_step
 
@@ -76,7 +76,7 @@ def test_mean_velocity_swings_as_a_sine(seed):
 
 
 def test_skewness_has_either_sign():
-    """About half of the flows are fastest in the upper half, by a |k| drawn evenly from its range."""
+    """About half of the flows have their maximum in the upper half; |k| is uniform in its range."""
     skewness = np.array([drawn(PIPE_2D_SKEWED, seed)(1).skewness for seed in range(400)])
     low, high = PIPE_2D_SKEWED.flow.skewness_range
     assert abs((skewness > 0).mean() - 0.5) < 0.1       # four standard deviations
@@ -84,7 +84,7 @@ def test_skewness_has_either_sign():
 
 
 def test_known_velocity_makes_the_episode_of_the_plain_pipe():
-    """Without randomness, and so the same spin-up, it is `PIPE_2D`: the same inflow and noise, to rounding."""
+    """Without randomness, and with the same spin-up, it equals `PIPE_2D`, with its inflow and noise, to rounding."""
     def of(velocity):
         return PIPE_2D_BIASED.with_changes(merged(CHANGES, {"flow": {"velocity_range": [velocity] * 2}}))
 
@@ -102,7 +102,7 @@ def test_known_velocity_makes_the_episode_of_the_plain_pipe():
 
 
 def test_slowest_fluid_flushes_the_pipe_before_the_start():
-    """``spin_up_steps`` steps take the slowest mean velocity, its swing included, through the whole pipe."""
+    """The slowest mean velocity, including the oscillation, passes the whole pipe in ``spin_up_steps`` steps."""
     for world in WORLDS:
         lowest = min(drawn(world, seed)(t).mean_velocity for seed in range(50) for t in range(0, 100, 5))
         length = world.vessel.length
@@ -113,7 +113,7 @@ def test_slowest_fluid_flushes_the_pipe_before_the_start():
 
 @each_unknown
 def test_recorded_flow_is_the_drawn_one(world):
-    """`Episode.velocity` is the profile at `VelocityModel.points` amid each time step, and has the drawn mean."""
+    """`Episode.velocity` is the profile at `VelocityModel.points` in the middle of each step, with the drawn mean."""
     world = world.with_changes(FAST)
     velocity = simulate(world, 7, cache=False).velocity
     model = world.velocity_model
@@ -131,7 +131,7 @@ def test_recorded_flow_is_the_drawn_one(world):
 
 
 def test_recorded_flow_is_the_one_that_carries():
-    """From one cached state to the next with the cached mean velocity, in the truth's two steps: to rounding."""
+    """The truth's two transport steps with the cached mean velocity give the next cached state to rounding."""
     world = PIPE_2D_TIME_VARYING.with_changes(FAST)
     half_width = world.vessel.half_width
     truth = cached_truth_model(world)
@@ -151,7 +151,7 @@ def test_recorded_flow_is_the_one_that_carries():
 
 @each_world
 def test_a_reference_is_given_the_flow_that_carries(world):
-    """A step with it, on the estimators' mesh, is one with the flow drawn for that very step, to the bit."""
+    """The true transport is bit-identical to a step on the estimator mesh with the flow drawn for that step."""
     world = world.with_changes(FAST)
     model, flow = world.estimator_model(), drawn(world, 7)
     transport_at = world.true_transport(model, episode_streams(7).flow)

@@ -11,12 +11,12 @@ SMALL = PIPE_3D.with_changes({
 
 @pytest.fixture(scope="module")
 def model():
-    """The estimators' model of the small pipe."""
+    """Return the estimator model of the small pipe."""
     return SMALL.estimator_model()
 
 
 def areas(cem):
-    """(L,) of each electrode's triangles in m²."""
+    """Return the areas (L,) of the electrodes in m²."""
     sides = [np.diff(cem.mesh.points[facets], axis=1) for facets in cem.electrodes]
     return np.array([0.5 * np.linalg.norm(np.cross(side[:, 0], side[:, 1]), axis=1).sum() for side in sides])
 
@@ -41,7 +41,7 @@ def test_electrodes_have_their_size_and_place(model):
 
 @pytest.mark.parametrize(("rings", "per_ring"), [(1, 4), (2, 4), (3, 6), (4, 8), (5, 8)])
 def test_every_injection_injects(rings, per_ring):
-    """One source and one sink, half a turn apart, odd injections within a ring; all rings take part in a frame."""
+    """Pairs are half a turn apart, odd injections within a ring; a frame uses all rings."""
     world = PIPE_3D.with_changes({"vessel": {"electrode_rings": rings, "electrodes_per_ring": per_ring}})
     currents = world.currents
     assert currents.shape == (16, rings * per_ring)
@@ -54,7 +54,7 @@ def test_every_injection_injects(rings, per_ring):
 
 
 def test_slugs_enter_anywhere_within_seven_tenths_of_the_radius():
-    """Places are even over the disc: the mean square distance is half the largest."""
+    """Positions are uniform over the disc: the mean square distance is half the largest."""
     places = SMALL.vessel.sample_inlet_points(np.random.default_rng(0), 20_000)
     distance = np.hypot(*places.T)
     assert distance.max() < 0.7 * SMALL.vessel.radius

@@ -21,7 +21,7 @@ ID = "mine/Quiet-v0"
 
 @dataclass(frozen=True)
 class Never:
-    """Arrivals of a user of tomorrow: no slug comes."""
+    """Third-party arrivals: without slugs."""
 
     def draw(self, random: np.random.Generator, begin: float, end: float) -> np.ndarray:
         return np.empty(0)
@@ -51,7 +51,7 @@ def restored(monkeypatch):
 
 
 def hands() -> list[str]:
-    """Ids registered by hand."""
+    """Ids registered by a script."""
     return [each.id for each in registry.runtime_entries()]
 
 
@@ -96,7 +96,7 @@ def test_an_id_belongs_to_one_world():
 
 @pytest.mark.parametrize("id", ["Quiet-v0", "mine/Quiet", "mine/a/Quiet-v0", "mine/Quiet-v0 ", ""])
 def test_ids_of_another_form_are_refused(id):
-    """Before anything is registered."""
+    """An invalid registration is rejected before any change."""
     with pytest.raises(ValueError, match="id must look like 'namespace/Name-v0', got"):
         register(QUIET, id)
     assert id not in entries()
@@ -110,7 +110,7 @@ def test_ids_of_another_form_are_refused(id):
     ({"assume": {"mean_velocity": {1.0}}}, "not JSON"),
 ])
 def test_settings_of_another_track_are_refused(settings, message):
-    """Each track has its own; what is refused leaves nothing behind."""
+    """Each track has its settings; a rejected registration has no effect."""
     with pytest.raises(ValueError, match=message):
         register(QUIET, ID, **settings)
     assert ID not in entries()
@@ -127,16 +127,16 @@ def test_another_process_takes_over(tmp_path):
     """An id of a script runs in other processes, bit-identical."""
     world = PIPE_2D.with_changes(PIPE)
     register(world, ID, lag=2, description="Mine.", test_seeds="test:0-2")
-    told = tmp_path / "told"
-    told.write_bytes(pickle.dumps(registry.runtime_entries()))
+    path = tmp_path / "entries"
+    path.write_bytes(pickle.dumps(registry.runtime_entries()))
     code = ("import pathlib, pickle, sys\n"
             "import gymnasium as gym\n"
             "from eitbench.worlds import entry, registry\n"
-            f"told = pickle.loads(pathlib.Path({str(told)!r}).read_bytes())\n"
+            f"stored = pickle.loads(pathlib.Path({str(path)!r}).read_bytes())\n"
             "for _ in range(2):\n"
-            "    registry.import_entries(told)\n"
-            "assert entry(told[0].id) == told[0]\n"
-            "env = gym.make(told[0].id)\n"
+            "    registry.import_entries(stored)\n"
+            "assert entry(stored[0].id) == stored[0]\n"
+            "env = gym.make(stored[0].id)\n"
             "assert env.unwrapped.lag == 2\n"
             "print(env.reset(seed=1)[0]['voltages'].tobytes().hex())")
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
@@ -155,7 +155,7 @@ def test_who_is_told_last_counts():
 
 
 def test_modules_of_entry_points_are_imported(monkeypatch, tmp_path):
-    """One that raises is left out with a warning; the others are there, and not as if by hand."""
+    """A package that raises is omitted with a warning; the others are registered, and not as entries of a script."""
     (tmp_path / "their_worlds.py").write_text(PACKAGE)
     (tmp_path / "broken_worlds.py").write_text("raise RuntimeError('out of order')\n")
     monkeypatch.syspath_prepend(tmp_path)

@@ -27,13 +27,13 @@ SHIFTS = [id for id, each in entries().items() if each.nominal == NOMINAL_ID]
 
 
 def small(id):
-    """The world of an id, whose episodes take a third of a second."""
+    """Return the world of an id, with episodes of a third of a second."""
     return entry(id).world.with_changes(world(id)["world"])
 
 
 @pytest.mark.parametrize("id", SHIFTS)
 def test_the_task_is_that_of_home(id):
-    """Numbers, and what the models compute: where fluid is carried, and voltages with their derivatives."""
+    """Return parameters and model outputs of a task: transport, and voltages with their derivatives."""
     here, there = make_task(small(id)), make_task(small(NOMINAL_ID))
     for name in ("noise", "n_steps", "warm_up", "lag", "expected_concentration", "calibration", "prior",
                  "velocity", "vessel"):
@@ -64,7 +64,7 @@ def test_a_home_where_other_things_are_told_is_refused(id, changes, home, messag
 
 
 def wave(world, seed, times):
-    """ln(c/background) that flows in at the model's inlet, (times, nodes)."""
+    """Return ln(c/background) of the inflow at the model's inlet, (times, nodes)."""
     mesh, inlet = world.vessel.transport_mesh(fine=False)
     inflow = world.target.draw_inflow(world, episode_streams(seed).inflow)
     return np.log(np.array([inflow(mesh.points[inlet], time) for time in times]) / world.background)
@@ -89,7 +89,7 @@ def test_short_slugs_last_half_as_long():
 
 
 def test_readings_have_twice_the_noise_that_is_told():
-    """Of every kind, and drawn as at home; the fluid is that of home."""
+    """Faults of all kinds are drawn as in the nominal environment, with the same fluid."""
     assert PIPE_2D_DOUBLE_NOISE.truth_config == PIPE_2D.truth_config and PIPE_2D_DOUBLE_NOISE.name == PIPE_2D.name
     random = np.random.default_rng(0)
     resistance = random.normal(size=(2000, 16, 16))
@@ -140,7 +140,7 @@ def test_contacts_are_drawn_evenly_and_anew():
 
 
 def test_slugs_of_the_other_inlet_are_at_the_walls():
-    """Between 0.7 and 0.95 R on both sides, where at home none is; and half as wide as the narrowest there."""
+    """Slugs are at 0.7 to 0.95 R on both sides, nominally at most at 0.7 R, and narrower than nominal ones."""
     reach = PIPE_2D_OTHER_INLET.target.radial_range
     places = PlanePipe().sample_inlet_points(np.random.default_rng(0), 5000, reach)[:, 0] / 0.05
     assert kstest(np.abs(places), "uniform", (0.7, 0.25)).pvalue > 1e-3 and abs(np.sign(places).mean()) < 0.05
@@ -148,6 +148,6 @@ def test_slugs_of_the_other_inlet_are_at_the_walls():
     assert there.max() <= 0.7
     assert PIPE_2D_OTHER_INLET.target.transverse_std[1] < PIPE_2D.target.transverse_std[0]
     square = ((RoundPipe().sample_inlet_points(np.random.default_rng(0), 5000, (0.7, 0.95)) / 0.05)**2).sum(axis=1)
-    assert kstest(square, "uniform", (0.49, 0.95**2 - 0.49)).pvalue > 1e-3          # every area as often
+    assert kstest(square, "uniform", (0.49, 0.95**2 - 0.49)).pvalue > 1e-3          # uniform by area
     middle = np.abs(wave(PIPE_2D_OTHER_INLET, 0, np.arange(0.0, 0.3, 5e-3))).max(axis=0)
     assert middle[10] < 0.02 < 0.2 < middle.max()

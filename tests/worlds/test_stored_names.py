@@ -87,7 +87,7 @@ def test_a_field_may_have_the_earlier_name_of_another():
 
 
 def test_earlier_members_of_a_world():
-    """Third-party parts may use them."""
+    """Third-party components may use earlier names."""
     with pytest.warns(DeprecationWarning, match="lead_in is now spin_up_steps"):
         assert PIPE_2D.lead_in == PIPE_2D.spin_up_steps
     with pytest.warns(DeprecationWarning, match="changed is now with_changes"):

@@ -1,6 +1,6 @@
-"""The round tanks: a ball on an orbit of a steady flow, cylinders that stand still, and electrodes where they are said.
+"""The round tanks: a ball in a steady flow, stationary cylinders, and positions of electrodes.
 
-Nothing of the truth may come from the estimators' meshes: an estimator would be tested against its own mistakes.
+The truth must not use the estimator meshes: an estimator would be tested against its own errors.
 """
 
 from functools import lru_cache
@@ -26,7 +26,7 @@ each_world = pytest.mark.parametrize("world", [SHORT, STILL], ids=["rotating", "
 
 
 def flow_stream(seed):
-    """The stream that an episode's flow, or what stands in it, is drawn from."""
+    """Return the random stream of an episode's flow or bodies."""
     return episode_streams(seed).flow
 
 
@@ -37,19 +37,19 @@ def stirred(rings):
 
 @lru_cache(maxsize=8)
 def episode(world, seed):
-    """Simulated without a cache on disk."""
+    """Simulate an episode without a cache on disk."""
     return simulate(world, seed, cache=False)
 
 
 @lru_cache(maxsize=4)
 def both(world):
-    """The discretisations of the truth and of the model."""
+    """Return the discretisations of the truth and of the model."""
     return cached_truth_model(world), world.estimator_model()
 
 
 @pytest.mark.parametrize(("n_electrodes", "cover"), [(16, 0.5), (7, 0.8), (4, 0.05)])
 def test_electrodes_lie_where_the_spans_say(n_electrodes, cover):
-    """Each has ``cells_at_electrodes`` facets, whose chords end at its edges and are as long as an arc so cut is."""
+    """Each electrode has ``cells_at_electrodes`` facets, chords of its arc that end at its edges."""
     tank = RoundTank(n_electrodes=n_electrodes, electrode_coverage=cover)
     spans, R = tank.electrode_spans, tank.radius
     np.testing.assert_allclose((spans[:, 1] - spans[:, 0]).sum(), 2.0 * np.pi * cover, rtol=1e-12)
@@ -66,7 +66,7 @@ def test_electrodes_lie_where_the_spans_say(n_electrodes, cover):
         np.testing.assert_allclose([angle.min(), angle.max()], [first - middle, last - middle], atol=1e-9)
         chords = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1)
         np.testing.assert_allclose(chords, 2.0 * R * np.sin(0.5 * np.ptp(angle, axis=1)), rtol=1e-9)
-        assert np.ptp(angle, axis=1).sum() == pytest.approx(last - first, rel=1e-9)  # no part twice
+        assert np.ptp(angle, axis=1).sum() == pytest.approx(last - first, rel=1e-9)  # without overlap
         assert len(facets) == 6
     assert len(np.unique(np.concatenate(electrodes), axis=0)) == 6 * n_electrodes
 
@@ -99,7 +99,7 @@ def test_seed_decides_the_episode(world):
 
 
 def test_flow_rests_on_the_wall():
-    """No slip at the nodes of the wall and amid its facets, where the fastest fluid does half a metre a second."""
+    """The flow has no slip at wall nodes and facet midpoints; the largest speed is half a metre per second."""
     flow = stirred(24)
     ends = flow.mesh.points[flow.mesh.boundary_facets]
     for points in (ends[:, 0], ends.mean(axis=1)):
@@ -109,9 +109,9 @@ def test_flow_rests_on_the_wall():
 
 @pytest.mark.parametrize("seed", [1, 2])
 def test_ball_goes_round_on_an_orbit_of_the_flow(seed):
-    """Its centre moves with the mean velocity over the disc: an integral over 192 points, solved to high accuracy.
+    """The centre moves with the mean velocity over the disc: an integral over 192 points, solved to high accuracy.
 
-    In 2 s, or 1 m, the path may stray from that by 1 mm, a twentieth of the ball's radius.
+    In 2 s, or 1 m, the error of the path is at most 1 mm, a twentieth of the ball's radius.
     """
     flow, a = ROTATING.flow.nominal(ROTATING, fine=True), ROTATING.target.radius
     path = ROTATING.target.path(ROTATING, flow_stream(seed))
@@ -131,7 +131,7 @@ def test_ball_goes_round_on_an_orbit_of_the_flow(seed):
 
 
 def test_ball_begins_within_its_range():
-    """Evenly between the two radii, at any angle: no side of the tank is preferred."""
+    """Initial positions are uniform between the two radii and in angle."""
     one_step = ROTATING.with_changes({"schedule": {"warm_up": 0, "scored_steps": 1}})
     ball = one_step.target
     starts = np.array([ball.path(one_step, flow_stream(seed))[0] for seed in range(100)])
@@ -159,7 +159,7 @@ def test_ball_keeps_its_content_and_lies_on_its_path():
 
 
 def test_model_of_the_stirred_tank_has_no_ball_and_keeps_what_it_holds():
-    """Concentration is carried and spreads, but neither enters nor leaves; what is even stays even."""
+    """Concentration is advected and diffuses without inflow or outflow; a constant stays constant."""
     model = both(SHORT)[1]
     mesh = model.transport.mesh
     assert len(model.transport.inlet) == 0
@@ -192,7 +192,7 @@ def test_cylinders_stand_inside_apart_and_anywhere():
 
 
 def test_nothing_moves_in_the_tank_at_rest():
-    """The concentration is constant in time, to the bit, and so is the resistance that is measured, but for noise."""
+    """Concentration and transfer resistance are bit-identical at all times."""
     still = episode(STILL, 7)
     for array in (still.concentration, still.transfer_resistance):
         np.testing.assert_array_equal(array, np.broadcast_to(array[:1], array.shape))
@@ -212,7 +212,7 @@ def test_cylinders_hold_their_metal():
 
 
 def test_frame_of_the_tank_at_rest_measures_sixteen_things():
-    """Sixteen different injections, eight of them straight across, fifteen independent: all there are of zero sum."""
+    """Sixteen different injections, eight of them opposite, span all fifteen dimensions of zero sum."""
     currents = STATIONARY.currents
     assert currents.shape == (16, 16) and len(np.unique(currents, axis=0)) == 16
     np.testing.assert_array_equal(np.sort(currents, axis=1)[:, [0, -1]], [[-0.1, 0.1]] * 16)
@@ -220,4 +220,4 @@ def test_frame_of_the_tank_at_rest_measures_sixteen_things():
     assert np.linalg.matrix_rank(currents) == 15
     np.testing.assert_array_equal(currents[:8], -np.roll(currents[:8], 8, axis=1))
     pairs = {frozenset(np.flatnonzero(row).tolist()) for row in currents}
-    assert len(pairs) == 16                                              # none is another's reverse
+    assert len(pairs) == 16                                              # without reversed pairs

@@ -1,4 +1,4 @@
-"""`Task`: what an estimator may know; above all, nothing of what happened."""
+"""`Task`: information for an estimator, without the ground truth."""
 
 import functools
 import types
@@ -30,7 +30,7 @@ def cache(tmp_path, monkeypatch):
 
 
 def test_says_what_the_world_says():
-    """Times, currents, noise and level are the world's; estimates live on the CD mesh of its model."""
+    """Times, currents, noise and c_ref equal the world's; estimates are on the transport mesh of its model."""
     task = make_task(TINY)
     assert (task.n_steps, task.warm_up, task.lag, task.expected_concentration) == (5, 2, 0, 25.0)
     np.testing.assert_array_equal(task.currents, TINY.currents)
@@ -56,7 +56,7 @@ def test_wrong_lags(lag):
 
 
 def test_assumed_velocity_changes_the_model_not_the_world(cache):
-    """A wrong belief moves the model's fluid elsewhere; the episode and its voltages stay as they were."""
+    """A wrong assumption changes the model's flow, not the episode and its voltages."""
     right, wrong = environment(), environment(assume={"mean_velocity": 60.0})
     rng = np.random.default_rng(2)
     c = rng.uniform(20.0, 40.0, 1701)
@@ -69,7 +69,7 @@ def test_assumed_velocity_changes_the_model_not_the_world(cache):
 
 
 def played(env, action):
-    """Voltages, currents and reward of a whole episode."""
+    """Return voltages, currents and reward of a complete episode."""
     observation, _ = env.reset(seed=3)
     done = False
     while not done:
@@ -79,7 +79,7 @@ def played(env, action):
 
 
 def reachable(start):
-    """Every object that can be reached from ``start`` by attributes, items and closures."""
+    """Return all objects that can be reached from ``start`` by attributes, items and closures."""
     found, waiting = {}, [start]
     while waiting:
         thing = waiting.pop()
@@ -97,7 +97,7 @@ def reachable(start):
             waiting += [thing.__self__, thing.__func__]
         elif isinstance(thing, functools.partial):
             waiting += [thing.func, thing.args, thing.keywords]
-        elif isinstance(thing, types.FunctionType):  # its globals lead everywhere: they say nothing
+        elif isinstance(thing, types.FunctionType):  # its globals reach everything, so they are skipped
             waiting += [cell.cell_contents for cell in thing.__closure__ or ()]
             waiting.append(thing.__defaults__)
         waiting += [vars(thing)] if hasattr(thing, "__dict__") else []
@@ -107,7 +107,7 @@ def reachable(start):
 
 
 def sizes(discretisation):
-    """Lengths that arrays on these meshes have."""
+    """Return lengths of arrays on these meshes."""
     transport, observation = discretisation
     return {transport.mesh.n_nodes, len(transport.mesh.cells), len(observation.cem.mesh.points),
             len(observation.cem.mesh.cells), observation.cem.n_unknowns}
@@ -124,7 +124,7 @@ def traces_of_truth(task, world):
 
 
 def test_task_holds_nothing_of_the_truth():
-    """Not even while an episode is under way, nor through caches and closures."""
+    """The task does not reveal the truth during an episode, or through caches and closures."""
     assert sizes(cached_truth_model(TINY)).isdisjoint(sizes(TINY.estimator_model()))
     env = environment(lag=1)
     for _ in played(env, np.full(1701, 30.0)):
@@ -140,7 +140,7 @@ def test_task_holds_nothing_of_the_truth():
     lambda task, episode: replace(task, observation=cached_truth_model(TINY).observation),
 ], ids=["attribute", "closure", "container", "world", "fine model"])
 def test_the_search_finds_what_is_hidden(hide):
-    """The search above is worth something: a truth that is put into a task is found."""
+    """The search is effective: it finds a truth that is put into a task."""
     assert traces_of_truth(hide(make_task(TINY), simulate(TINY, 3)), TINY)
 
 

@@ -1,4 +1,4 @@
-"""A world: its numbers can be changed, its parts are what their protocols ask for, its streams go on from a state."""
+"""A world: overrides of parameters, protocols of its components, and random streams from a state."""
 
 import dataclasses
 import json
@@ -13,7 +13,7 @@ from eitbench.worlds.random_streams import episode_streams, generator_from_state
 
 
 def test_only_what_is_named_changes():
-    """Everything else is the same object; lists become tuples, and a part's part can be changed."""
+    """Other components are the same objects; lists become tuples, and nested components can be changed."""
     world = PIPE_2D.with_changes({"target": {"log_amplitude": [0.1, 0.2], "arrivals": {"interval": 0.03}},
                              "instrument": {"noise_relative": 0.02}})
     assert world.target.log_amplitude == (0.1, 0.2)
@@ -34,7 +34,7 @@ def test_only_what_is_named_changes():
 
 @pytest.mark.parametrize("id", entries())
 def test_every_number_can_be_named(id):
-    """A change of each to what it is changes nothing; and a copy from another process is equal."""
+    """Overrides with present values change nothing; a copy from another process is equal."""
     world = entries()[id].world
 
     def numbers(part) -> dict:
@@ -106,7 +106,7 @@ def test_a_part_without_what_its_protocol_asks_for_is_refused(name, part, messag
 
 
 def test_a_generator_goes_on_from_a_state():
-    """It draws what the other would, also from a state that went through JSON; what it spawns differs by episode."""
+    """A generator from a state continues the stream, also through JSON; spawned streams differ by episode."""
     spawned = []
     for seed in range(3):
         policy = episode_streams(seed).policy
