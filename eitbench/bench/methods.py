@@ -206,10 +206,10 @@ def golden_version(name: str) -> int:
 
 
 def method_files(path: Path) -> dict[str, bytes]:
-    """Map names to contents of the files of a method: the own, first, those that its class names in
-    ``files = ("weights.npz",)``, and those that `eitbench.rl.save_agent` writes with a model.
+    """Map names to contents of the files of a method: its own first, then the files that its class
+    names in ``files = ("weights.npz",)``, or that `eitbench.rl.save_agent` writes with a model.
 
-    The source is parsed, not executed. ``ValueError`` if a named file is not in its folder."""
+    The source is parsed, not executed. ``ValueError`` if a named file is not in the folder."""
     source = path.read_bytes()
     if path.suffix != ".py":
         return {path.name: source} | {name: path.with_name(name).read_bytes()

@@ -1,4 +1,4 @@
-"""Learning policies by reinforcement learning (layer 8; extra ``rl``), and policies of trained agents."""
+"""Reinforcement learning of injection policies (extra ``rl``), and policies of trained agents."""
 
 from eitbench.rl.agents import AgentPolicy, save_agent
 

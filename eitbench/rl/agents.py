@@ -34,7 +34,7 @@ class AgentPolicy:
     """
 
     estimator: ClassVar[str] = "reduced"
-    """Filter of the environment in which the agent in trained: "reduced" or "full"."""
+    """Filter of the environment in which the agent was trained: "reduced" or "full"."""
 
     def __init__(self, rules: Rules, random: np.random.Generator) -> None:
         self.rules = rules
