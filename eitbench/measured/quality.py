@@ -32,6 +32,8 @@ SPIKE_WINDOW = 5
 SPIKE_SIZE, SPIKE_RATIO = 0.2, 10.0
 """A spike differs from the median of its window by this fraction of the injection's RMS voltage,
 and by this multiple of the range of the other voltages."""
+SPIKE_CHUNK = 1000
+"""Uses of an injection that are searched for spikes at once."""
 N_NAMED_SPIKES = 3
 
 
@@ -43,16 +45,20 @@ def find_spikes(measurements: Measurements) -> np.ndarray:
         uses = np.flatnonzero(measurements.injection_index == k)
         if len(uses) < SPIKE_WINDOW:
             continue
-        voltages = np.asarray(measurements.voltages[uses])
-        first = np.clip(np.arange(len(uses)) - SPIKE_WINDOW // 2, 0, len(uses) - SPIKE_WINDOW)
-        windows = sliding_window_view(voltages, SPIKE_WINDOW, axis=0)[first]  # (uses, M, window)
-        typical = np.median(windows, axis=2)                   # NaN where a voltage is missing
-        deviations = np.sort(np.abs(windows - typical[..., None]), axis=2)
-        size = np.sqrt(np.nanmean(np.nanmedian(voltages, axis=0)**2)) if len(voltages) else 0.0
-        with np.errstate(invalid="ignore"):
-            own = np.abs(voltages - typical)
-            spikes[uses] = ((own > SPIKE_SIZE * size) & (own == deviations[..., -1])
-                            & (own > SPIKE_RATIO * deviations[..., -2]))
+        sample = measurements.voltages[uses[::-(-len(uses) // SPIKE_CHUNK)]]
+        size = np.sqrt(np.nanmean(np.nanmedian(sample, axis=0)**2))
+        starts = np.clip(np.arange(len(uses)) - SPIKE_WINDOW // 2, 0, len(uses) - SPIKE_WINDOW)
+        for begin in range(0, len(uses), SPIKE_CHUNK):        # large files stay on disk
+            chunk = slice(begin, begin + SPIKE_CHUNK)
+            first, last = starts[chunk][0], starts[chunk][-1] + SPIKE_WINDOW
+            windows = sliding_window_view(measurements.voltages[uses[first:last]], SPIKE_WINDOW,
+                                          axis=0)[starts[chunk] - first]  # (uses, M, window)
+            typical = np.median(windows, axis=2)               # NaN where a voltage is missing
+            deviations = np.sort(np.abs(windows - typical[..., None]), axis=2)
+            with np.errstate(invalid="ignore"):
+                own = np.abs(measurements.voltages[uses[chunk]] - typical)
+                spikes[uses[chunk]] = ((own > SPIKE_SIZE * size) & (own == deviations[..., -1])
+                                       & (own > SPIKE_RATIO * deviations[..., -2]))
     return spikes
 
 

@@ -81,7 +81,7 @@ def test_a_new_score_is_shown_everywhere(apart):
     made = render(collect(records))
     rows = {row["method"]: row for row in csv.DictReader(io.StringIO(made["leaderboard.csv"]))}
     for method, value in expected.items():
-        assert float(rows[method]["worst_step"]) == pytest.approx(value, rel=1e-5)
+        assert 100.0 * float(rows[method]["worst_step"]) == pytest.approx(value, rel=1e-5)
     assert "| worst |" in made["leaderboard.md"] and "**worst**: the worst step" in made["leaderboard.md"]
     site = render_site(collect(records))
     assert "the worst step" in site["environments/eitbench-Pipe2D-v0.html"].decode()
@@ -89,7 +89,7 @@ def test_a_new_score_is_shown_everywhere(apart):
             for name in ("kalman_filter", "homogeneous"))
     table = compare.compare(a, b, "worst_step")
     assert table["a"][0] == pytest.approx(expected["kalman_filter"]) and table["better"][0] == 1.0
-    assert said(compare.comparison_table(table, "kalman", "floor", "worst_step"))["verdict"][0] == "kalman"
+    assert said(compare.comparison_table(table, "kalman", "floor", "worst_step"))["better"][0] == "kalman"
 
 
 def test_higher_scores_can_be_better(apart):
@@ -102,7 +102,7 @@ def test_higher_scores_can_be_better(apart):
             episode["scores"]["worst_step"] = max(episode["step_errors"])
     table = compare.compare([records["kalman_filter"]], [records["homogeneous"]], "worst_step")
     assert table["better"][0] == 0.0
-    assert said(compare.comparison_table(table, "kalman", "floor", "worst_step"))["verdict"][0] == "floor"
+    assert said(compare.comparison_table(table, "kalman", "floor", "worst_step"))["better"][0] == "floor"
 
 
 @pytest.mark.parametrize("name", ["nis", "voltage_discrepancy", "beauty"])

@@ -213,7 +213,7 @@ def test_from_a_file_to_the_leaderboards_by_command(tmp_path):
     assert "Mine" in (tmp_path / "leaderboards" / "site" / "methods" / "mine.html").read_text(encoding="utf-8")
     text = (tmp_path / "leaderboards" / "leaderboard.md").read_text(encoding="utf-8")
     assert re.search(r"\| +1 +\| Mine mine@\w{8} +\|.*\| self-reported \|", text)
-    assert "## injection" in text and "(floor)" in text
+    assert "## injection" in text and "(naive baseline)" in text
 
     code, said, _ = eitbench("compare", "mine", "homogeneous")
     assert code == 0 and said.startswith("A: mine\nB: homogeneous\n") and "| Pipe2D-v0 " in said

@@ -128,7 +128,7 @@ def test_reward_is_the_decrease_of_the_error(estimator, name):
     played = base.world
     interpolation, mass = score_operators(played)
     truth = eitbench.simulate(played, 3).concentration.astype(float)
-    level = np.full(interpolation.shape[1], filter_of(base).concentration[0])
+    level = np.full(interpolation.shape[1], filter_of(base).c_ref[0])
     paid = 0
     for k in range(played.n_steps - 16):
         reward = env.step(int(actions[k]))[1]

@@ -60,7 +60,7 @@ def test_errors_are_those_in_the_region(estimator):
     truth = eitbench.simulate(world, 3).concentration.astype(float)
     mesh = world.truth_model().transport.mesh
     onto = base.task.mesh.interpolation_to(mesh.points)
-    level = np.full(onto.shape[1], filter_of(base).concentration[0])
+    level = np.full(onto.shape[1], filter_of(base).c_ref[0])
     paid = 0
     for k, action in enumerate(some_pairs()[:world.n_steps - 16]):
         reward = env.step(int(action))[1]
@@ -163,7 +163,7 @@ def test_full_operator_is_the_joint_filter_of_the_baselines():
     task = env.task
     pairs = electrode_pairs(16).tolist()
     env.reset(seed=5)
-    level = filter_of(env).concentration[0]
+    level = filter_of(env).c_ref[0]
     filter_ = Filter(velocity_states(task, level, VELOCITY_BOUNDS), linearise_at_reference(task, level))
     for t, voltages in enumerate(cycle_voltages(world, 5, cached_episode(world, 5))):
         current = world.currents[t % 16]

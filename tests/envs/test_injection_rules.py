@@ -147,7 +147,7 @@ def test_faults_depend_on_the_seed_alone_and_are_shown_by_doubt():
 @pytest.mark.parametrize(("name", "change", "message"), [
     (FAULTS, {"instrument": {"n_dead_range": [3, 2]}}, "n_dead_range must be a range least ≤ most"),
     (FAULTS, {"instrument": {"n_loose_range": [0, 12]}},
-     "must leave two electrodes sound, got up to 18 of 16"),
+     "must leave two electrodes without fault, got up to 18 of 16"),
     (FAULTS, {"instrument": {"n_loose_range": "01"}}, r"n_loose_range must be a range \(least, most\), got '01'"),
     (BUDGET, {"schedule": {"budget": -1}}, "budget must be"),
 ])

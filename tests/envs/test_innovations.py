@@ -33,7 +33,7 @@ def test_innovations_are_those_of_the_tasks_matrices(name, estimator):
     core, task, rules = env.core, env.task, env.rules
     operator = core._filters
     n = task.mesh.n_nodes
-    level = operator.concentration[0]
+    level = operator.c_ref[0]
     basis = operator._shared.states.basis if estimator == "reduced" else np.eye(n)
     sizes = []
     for k, pair in enumerate(some_pairs()[:core.length]):

@@ -31,7 +31,7 @@ def test_full_one_is_that_of_the_baseline():
     env, observation = begun("full")
     world, task = env.unwrapped.world, env.unwrapped.task
     core = env.unwrapped.core
-    ours = inflow_filter(task, fit_world_prior(world), float(filter_of(env).concentration[0]))
+    ours = inflow_filter(task, fit_world_prior(world), float(filter_of(env).c_ref[0]))
     for voltages, currents in zip(observation["frame"], world.currents, strict=True):
         ours.assimilate(voltages, currents)
     for action in some_pairs()[:world.n_steps - 16]:

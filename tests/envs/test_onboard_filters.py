@@ -31,7 +31,7 @@ def test_reduced_one_is_close_to_the_baselines():
     full = kalman_filter(start, [linear(v, world.currents[t % 16]) for t, v in enumerate(voltages)])
     env.reset(seed=5)
     core = env.unwrapped.core
-    assert filter_of(env).concentration[0] == pytest.approx(first.c_ref, rel=0.011)
+    assert filter_of(env).c_ref[0] == pytest.approx(first.c_ref, rel=0.011)
     for t in range(16, world.n_steps):
         env.step(number(world.currents[t % 16]))
         difference = core.estimate()[0][0] - full[t].mean
@@ -47,7 +47,7 @@ def test_full_one_is_that_of_the_baselines():
     core = env.unwrapped.core
     voltages = cycle_voltages(world, 5, cached_episode(world, 5))
     env.reset(seed=5)
-    start = table_5_1_filter(task.transport, task.prior, filter_of(env).concentration[0])
+    start = table_5_1_filter(task.transport, task.prior, filter_of(env).c_ref[0])
     linear = LinearisedForwardModel(task.observation, task.noise, start.mean)
     steps = kalman_filter(start, [linear(v, world.currents[t % 16]) for t, v in enumerate(voltages)])
     for t in range(16, world.n_steps):
@@ -64,9 +64,9 @@ def test_grid_of_the_full_one_is_that_of_its_covariance():
     env.reset(seed=5)
     shown = env.step(7)[0]["std"]
     operator = filter_of(env)
-    filter_, averages = operator._filters[0], operator._levels.patches
+    filter_, averages = operator._filters[0], operator._table.patches
     unit = np.eye(averages.shape[1])
     covariance = filter_.covariance.times(unit)
     variance = np.einsum("pn,nm,pm->p", averages, covariance, averages)
-    expected = operator.concentration[0] * np.sqrt(variance)
+    expected = operator.c_ref[0] * np.sqrt(variance)
     np.testing.assert_allclose(shown, expected, rtol=1e-8)
