@@ -61,7 +61,7 @@ def test_compare_and_skill_need_no_records(tmp_path, monkeypatch):
         return compare.compare(*pair, "error", compare.naive_baseline_records(tmp_path / "mine"))
 
     here = compared()
-    monkeypatch.setattr(compare, "SHIPPED", folder)
+    monkeypatch.setattr(compare, "BUNDLED_RECORDS", folder)
     pd.testing.assert_frame_equal(compared(), here)
     records = read_records(RESULTS)
     assert bundled_anchors(records) == anchors(records)
