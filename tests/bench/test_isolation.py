@@ -405,7 +405,7 @@ def test_a_changed_file_does_not_run(tmp_path):
 
 ABOUT = """import os
 from eitbench.bench.isolation import encode_message
-valid = {{"title": "Mine", "boards": ["filter"], "role": None, "parameters": {{}}, "suits": True}}
+valid = {{"title": "Mine", "subtracks": ["filter"], "role": None, "parameters": {{}}, "suits": True}}
 os.write(4, encode_message(valid | {{{}}}))
 """
 """A file that sends a reply in place of its process before it is loaded."""
@@ -417,7 +417,7 @@ os.write(4, encode_message(valid | {{{}}}))
     ("import os; os._exit(4)", "ended with status 4"),
     (ABOUT.format("'title': 'a' * 121"), "reports an invalid title"),
     (ABOUT.format("'title': 'a\\x1b[2J'"), "reports an invalid title"),
-    (ABOUT.format("'boards': [{}], 'role': [], 'name': 7"), "reports an invalid role, boards"),
+    (ABOUT.format("'subtracks': [{}], 'role': [], 'name': 7"), "reports an invalid role, subtracks"),
     (ABOUT.format("'parameters': {'a': 'b' * 10_000}"), "parameters must have at most"),
     (ABOUT.format("'privileged': True"), "is privileged"),
 ])

@@ -249,7 +249,7 @@ def test_errors_of_policies_are_ordered_and_pool_trainings():
     found = errors_by_policy(rows)
     assert list(found) == ["clairvoyant", "ppo", "best_pair", "random_pair", "bold"]
     assert found["ppo"].tolist() == pytest.approx([2.0, 2.1, 2.2])
-    assert gap_text(rows) == "adaptivity gap 0.49 (an interval takes 6 episodes) over 3 episodes"
+    assert gap_text(rows) == "normalised adaptivity gap 0.49 (an interval takes 6 episodes) over 3 episodes"
     assert gap_text(rows[rows["policy"] != "clairvoyant"]) == ""
 
 
