@@ -213,7 +213,7 @@ def test_tables_equal_a_computation_by_hand():
         "iirc": [record_of("good", [1.0, 2.0, 3.0]), record_of("naive", [8.0], "floor")],
         "montreal": [record_of("good", [1.0]), record_of("late", [3.0]), record_of("naive", [4.0], "floor")]}, [])
     assert [[cell.plain_text for cell in row.cells] for row in measured.case_table("iirc").rows] == [
-        ["good good@v1", "2 1 to 3", "10"], ["naive naive@v1 (floor)", "8 8 to 8", "10"]]
+        ["good good@v1", "2 1 to 3", "10"], ["naive naive@v1 (naive baseline)", "8 8 to 8", "10"]]
     rows = [[cell.plain_text for cell in row.cells] for row in measured.all_cases_table().rows]
     assert [row[0].split("@")[0] for row in rows] == ["good", "naive", "late"]
     assert [float(row[-1]) for row in rows] == [0.25, 1.0, 0.75]             # √(2/8 · 1/4)

@@ -15,6 +15,7 @@ from eitbench.bench.statistics import interquartile_mean, stratified_bootstrap
 from eitbench.bench.tracks import environment_name
 from eitbench.report.boards import ALL, boards, record_category
 from eitbench.report.site import collect, render
+from eitbench.report.tables import BADGES
 
 from tiny import BOARD_IDS, RUN, record, sha
 
@@ -244,8 +245,8 @@ def test_csv_and_markdown_agree_with_the_episodes(folder):
         assert float(cells["ẽ_c"].split()[0]) == pytest.approx(row["error"], rel=0.1)
         ranked = row["rank"] > 0
         assert cells["rank"].split()[0] == (f"{row['rank']:.0f}" if ranked else "–")
-        assert ranked or cells["method"].endswith(f"({row['note']})")
-        assert cells["by"] == ("official" if row["official"] else "self-reported")
+        assert ranked or cells["method"].endswith(f"({BADGES.get(row['note'], row['note'])})")
+        assert cells["run by"] == ("official" if row["official"] else "self-reported")
     assert "All environments" in texts["leaderboard.md"] and (table["environment"] == ALL).sum() == 2
 
 

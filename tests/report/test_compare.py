@@ -86,7 +86,7 @@ def test_over_environments_gains_are_compared():
     gains = on_boards[on_boards["environment"] == "all"].set_index("method")["gain"]
     assert (table["a"][2], table["b"][2]) == pytest.approx((gains["a"], gains["b"]), rel=1e-12)
     text = said(comparison_table(table, "a", "b"))
-    assert list(text["better"]) == ["a", "b", "a"] and text["ẽ_c of a"][2].startswith("gain 0.")
+    assert list(text["better"]) == ["a", "b", "a"] and text["ẽ_c of a"][2].startswith("skill score 0.")
     assert list(compare(a, b)["environment"]) == [PIPE_NAME, TANK_NAME]
     others = compare(a, b, "seconds_per_step", floor)
     assert list(others["environment"]) == [PIPE_NAME, TANK_NAME, "all"]
@@ -109,13 +109,13 @@ def test_what_cannot_be_compared():
     a = [record("a", [0.1])]
     for b in ([record("b", [0.1], id=TANK)], [record("b", {"test:9": 0.1})], [record("b", {"dev:0": 0.1})],
               [record("b", [None])]):
-        with pytest.raises(ValueError, match="no environment in which both have finished an episode"):
+        with pytest.raises(ValueError, match="methods must share an environment and a seed that both finished"):
             compare(a, b)
 
 
 def test_records_are_found_by_name_version_and_file(tmp_path, monkeypatch):
     """A name is sufficient if it has one version."""
-    monkeypatch.setattr(comparison, "SHIPPED", tmp_path)
+    monkeypatch.setattr(comparison, "BUNDLED_RECORDS", tmp_path)
     a, (b, _) = two_methods()
     paths = [write_record(tmp_path, each) for each in [*a, b]]
     assert find_records("a", tmp_path) == a and find_records(f"a@{sha('a1')[:4]}", tmp_path) == a
@@ -133,7 +133,7 @@ def test_records_are_found_by_name_version_and_file(tmp_path, monkeypatch):
     write_record(tmp_path, tenth := record("c", [0.1], version="v10"))
     assert find_records("c@v1", tmp_path) == ours[:1] and find_records("c", tmp_path) == [tenth]
     for nobody in ("d", "c@v", f"a@{sha('a1')[:3]}"):                # four digits are sufficient
-        with pytest.raises(ValueError, match=f"record of {nobody} in"):
+        with pytest.raises(ValueError, match=f"record of {nobody} not found in"):
             find_records(nobody, tmp_path)
 
 
@@ -158,7 +158,7 @@ def test_words_follow_from_the_intervals():
 def test_who_is_not_in_the_folder_comes_with_the_package(tmp_path, monkeypatch):
     """After a first submission in a user's folder, the method is compared with built-in ones and naive baselines."""
     shipped, own = tmp_path / "shipped", tmp_path / "own"
-    monkeypatch.setattr(comparison, "SHIPPED", shipped)
+    monkeypatch.setattr(comparison, "BUNDLED_RECORDS", shipped)
     ours, floor = record("kalman_filter", [0.1], version="v1"), record("homogeneous", [0.2], role="floor")
     for folder, each in ((own, mine := record("mine", [0.1])), (shipped, ours), (shipped, floor)):
         write_record(folder, each)
@@ -172,7 +172,7 @@ def test_in_a_terminal_lines_are_not_wrapped():
     table = compare(a, b)
     whole, narrow = (format_comparison(table, "a_long_name", "another", "error", letters) for letters in (200, 60))
     assert whole.startswith("A: a_long_name\nB: another\n\n| environment") and "columns omitted" not in whole
-    assert narrow.endswith("columns omitted: episodes, ẽ_c of A, ẽ_c of B, A better")
+    assert narrow.endswith("episodes, ẽ_c of A, ẽ_c of B, A better")
     rows = narrow.split("\n\n")[1].splitlines()
     assert max(map(len, rows)) <= 60 and rows[0].split() == ["|", "environment", "|", "better", "|", "difference", "|"]
     assert rows[3].split()[:4] == ["|", TANK_NAME.removeprefix("eitbench-"), "|", "A"]
