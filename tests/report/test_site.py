@@ -333,7 +333,7 @@ def test_every_link_resolves(site, pages):
     assert links > 50
 
 
-def test_links_beside_the_site(tmp_path):
+def test_links_to_files_of_the_repository(tmp_path):
     """Links to files of the repository exist."""
     folder = tmp_path / "leaderboards"
     for name in (LINKS["Submit a method"], LINKS["Code"], f"{METHODS_FOLDER}/kalman_filter.py", *(
