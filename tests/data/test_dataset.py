@@ -218,7 +218,7 @@ def test_another_folder_is_not_touched(tiny, tmp_path):
         export(tiny, tmp_path)
     assert [path.name for path in tmp_path.iterdir()] == ["mine.txt"]
     export(tiny, tmp_path / "theirs")
-    with pytest.raises(ValueError, match="of another environment, format or version"):
+    with pytest.raises(ValueError, match="has another environment, format or version"):
         export(tiny, tmp_path / "theirs", "hdf5")
 
 
