@@ -36,7 +36,7 @@ def without_extras(program, *arguments):
 
 
 @pytest.mark.parametrize("id", ["eitbench/StationaryTank2D-v0", "eitbench/Pipe2DInjection-v0"])
-def test_the_base_plays(id):
+def test_environments_need_no_extra(id):
     done = without_extras(PLAY, id)
     assert done.returncode == 0, done.stderr
     assert done.stdout.endswith("False False\n")
@@ -48,7 +48,7 @@ def test_what_is_missing_is_named(program, said):
     assert done.returncode == 1 and done.stderr.splitlines()[-1].removeprefix("ModuleNotFoundError: ").startswith(said)
 
 
-def test_each_extra_installs_what_it_is_said_to():
+def test_each_extra_installs_its_packages():
     """The base dependencies contain none of the optional packages."""
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     distributions = packages_distributions()

@@ -16,7 +16,7 @@ def clock(monkeypatch):
 
 
 @pytest.mark.parametrize(("seconds_a_step", "said"), [(0.1, 1), (0.01, 0)])
-def test_what_is_long_is_said_once(seconds_a_step, said, clock, caplog):
+def test_long_tasks_are_reported_once(seconds_a_step, said, clock, caplog):
     caplog.set_level(logging.INFO, "eitbench")
     wait = SlowTaskNotice("making it", 100, "a command does so beforehand")
     for _ in range(100):
@@ -26,7 +26,7 @@ def test_what_is_long_is_said_once(seconds_a_step, said, clock, caplog):
         "making it, 10 s or less; a command does so beforehand"]
 
 
-def test_a_terminal_is_told_there(monkeypatch, capsys, caplog):
+def test_a_notice_is_printed_in_a_terminal(monkeypatch, capsys, caplog):
     caplog.set_level(logging.INFO, "eitbench")
     monkeypatch.setattr(_notice.sys.stderr, "isatty", lambda: True, raising=False)
     _notice.notify("hello")

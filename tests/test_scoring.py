@@ -106,7 +106,7 @@ def test_crps_without_spread_is_the_absolute_error():
 
 
 @pytest.mark.parametrize("level", [0.5, 0.9])
-def test_honest_gaussians_are_covered_as_often_as_they_say(level):
+def test_calibrated_gaussians_have_the_nominal_coverage(level):
     """Truth drawn from the forecast: coverage is the level within five binomial deviations; twice the std is more."""
     rng = np.random.default_rng(2)
     mean, std = rng.normal(size=(200, 300)), rng.uniform(0.5, 2.0, (200, 300))

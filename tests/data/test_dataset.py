@@ -200,7 +200,7 @@ def test_files_hold_the_same_and_more_can_be_added(tiny, tmp_path, format, suffi
     assert ": train:0-1." in (folder / "README.md").read_text()
 
 
-def test_the_score_on_the_card_is_ours(tiny, tmp_path, monkeypatch):
+def test_the_score_in_the_readme_equals_errors(tiny, tmp_path, monkeypatch):
     """The code of the README runs in the folder of its files."""
     export(tiny, tmp_path)
     monkeypatch.chdir(tmp_path)

@@ -133,7 +133,7 @@ def test_cycle_voltages_have_the_faults_of_the_episode():
     np.testing.assert_array_equal(read[np.ix_(~passes, others)], sound[np.ix_(~passes, others)])
 
 
-def test_playing_what_is_stored_needs_no_finite_elements(episode):
+def test_cached_episodes_need_no_finite_elements(episode):
     """Environments build no mesh if the episode and the scoring constants are cached."""
     cached_episode(TINY, 7), scoring_constants(TINY)
     program = (f"import sys, gymnasium as gym, numpy as np, eitbench\n"
@@ -172,7 +172,7 @@ def test_first_steps_have_the_bits_of_the_whole(id):
 @pytest.mark.parametrize(("id", "kwargs"), [
     ("eitbench/Pipe2DFixedLag-v0", {"lag": 2}), ("eitbench/Pipe2DInjectionFlow-v0", {"estimator": "none"}),
     ("eitbench/RotatingTankInjection-v0", {})])
-def test_playing_is_the_same_whether_it_was_recorded_before(id, kwargs):
+def test_episodes_are_the_same_with_and_without_a_cache(id, kwargs):
     """Observations and rewards are bit-identical; an episode is not cached before a step needs it."""
     world = entry(id).world.with_changes(longer(id))
 

@@ -54,7 +54,7 @@ def test_errors_say_what_was_expected(text, message):
     assert repr(text) in str(caught.value)
 
 
-def test_playing_for_scores_leaves_other_warnings_alone():
+def test_evaluations_leave_other_warnings_unchanged():
     """The warning appears once per line of the user, and not within `allow_test_seeds`."""
     with warnings.catch_warnings(record=True) as said:
         warnings.simplefilter("default")

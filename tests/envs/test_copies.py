@@ -81,7 +81,7 @@ def test_a_copy_goes_on_as_the_original_would(name, given):
 @copied
 @pytest.mark.parametrize(("name", "given"), [(PIPE, {}), (INJECTION, {}), (INJECTION, {"threads": 2}), (FLOW, {}),
                                              (INFLOW, {"threads": 2})])
-def test_many_at_once(name, given, how):
+def test_vector_environments(name, given, how):
     """Copies of vector environments are equal too, with or without threads, also beyond the episode's end."""
     envs = gym.make_vec(name, num_envs=3, vectorization_mode="vector_entry_point", **changes(name, given))
     envs.reset(seed=1)

@@ -154,7 +154,7 @@ def test_frames_show_truth_estimate_and_spread(name):
     assert len({picture.tobytes() for picture in (first, flat, spread, bright)}) == 4
 
 
-def test_a_test_episode_is_said_to_be_one():
+def test_a_reset_to_a_test_episode_warns():
     """The warning appears once, at the line of the reset, with any wrapper, but not in evaluations or for train
     and dev seeds."""
     wrapped = make(PIPE)

@@ -106,7 +106,7 @@ def test_voltages_are_those_of_the_pair():
         assert over == (t == base.world.n_steps - 1)
 
 
-def test_first_frame_is_the_worlds_own():
+def test_first_frame_uses_the_cycle_of_the_world():
     """The agent of a filter begins after a frame of the cycle; observations contain its voltages."""
     env = make("reduced")
     observation, _ = env.reset(seed=3)
@@ -149,7 +149,7 @@ def test_reward_is_the_decrease_of_the_error(estimator, name):
 
 @every
 @shown_as
-def test_side_by_side_as_one_by_one(name, estimator, observation):
+def test_vectorised_as_single(name, estimator, observation):
     """18 vectorised and 18 single environments are bit-identical, also after an episode's end and with threads."""
     kwargs = {"num_envs": 18, "estimator": estimator, "episodes": 3, "observation": observation}
     envs = [make_many(name, mode="sync", **kwargs), *(make_many(name, threads=threads, **kwargs) for threads in (1, 2))]
@@ -173,7 +173,7 @@ def test_side_by_side_as_one_by_one(name, estimator, observation):
 
 
 @pytest.mark.parametrize("name", [FAULTS, INFLOW])
-def test_with_the_full_filter_too_others_beside_change_nothing(name):
+def test_episodes_are_independent_with_the_full_filter(name):
     """An episode is bit-identical alone and together with another one."""
     alone, beside = (make_many(name, n, estimator="full") for n in (1, 2))
     shown = [(alone.reset(seed=[0])[0], beside.reset(seed=[0, 1])[0])]

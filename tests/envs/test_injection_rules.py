@@ -45,7 +45,7 @@ def test_a_pair_and_its_currents_are_the_same():
             np.testing.assert_allclose(b[key], array, rtol=1e-5, atol=1e-5, err_msg=key)
 
 
-def test_budget_is_spent_and_then_nothing_flows():
+def test_budget_limits_the_number_of_injections():
     """Only injections count; without one, or beyond the budget, the estimate is not updated."""
     env = make("reduced", BUDGET, longer={"schedule": {"scored_steps": 8, "budget": 2}})
     observation, _ = env.reset(seed=1)
@@ -66,7 +66,7 @@ def test_budget_is_spent_and_then_nothing_flows():
     assert env.unwrapped.core.n_injections == [2]
 
 
-def test_dead_electrodes_read_nothing_and_carry_nothing():
+def test_dead_electrodes_measure_interference_and_carry_no_current():
     """A broken wire measures interference and carries no current; other voltages are 𝓡 I."""
     instrument = Instrument(n_dead_range=(3, 3), n_failing_range=(2, 2), n_loose_range=(2, 2), interference=0.5)
     noise = instrument.noise
@@ -106,7 +106,7 @@ def test_dead_electrodes_read_nothing_and_carry_nothing():
     assert not read(broken[late], currents, zero).any()
 
 
-def test_a_floor_adds_to_the_noise():
+def test_a_noise_floor_adds_to_the_noise():
     """The noise floor adds in quadrature; without a current it is the only noise."""
     rng = np.random.default_rng(1)
     instrument = Instrument(noise_floor=2e-3)

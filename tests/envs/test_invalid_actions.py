@@ -62,7 +62,7 @@ def test_wrong_actions_are_named(id, action, message):
 
 
 @pytest.mark.parametrize("ask", ["truth", "true_velocity", "privileged_info"])
-def test_there_is_nothing_to_show_before_a_reset(ask):
+def test_a_reset_is_required(ask):
     """Rendering, steps and errors require a reset."""
     env = make(PIPE).unwrapped
     with pytest.raises(gym.error.ResetNeeded, match=rf"call reset\(\) before {ask}\(\)"):

@@ -148,7 +148,7 @@ def test_node_voltages_are_those_of_all_nodes(parts):
     assert 0.0 < derivative < 0.03
 
 
-def test_what_a_pair_teaches_is_foretold():
+def test_design_criteria_equal_the_posterior_variance():
     """The criterion's variance equals the filter's variance after the injection, if all measurements are accepted;
     criteria are the decrease of the expected error."""
     env, observation = begun("reduced")
@@ -183,7 +183,7 @@ def test_expected_error_is_that_of_the_spread():
 
 
 @pytest.mark.parametrize("name", [FAULTS, BUDGET])
-def test_other_worlds_may_know_the_inflow_too(name):
+def test_other_environments_may_use_the_fitted_inflow(name):
     """An argument selects the prior; world and episodes do not depend on it."""
     env = make("reduced", name, inflow="learned")
     assert env.unwrapped.world == make("none", name).unwrapped.world

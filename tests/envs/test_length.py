@@ -8,7 +8,7 @@ from short import short
 
 
 @pytest.mark.parametrize("name", ["eitbench/Pipe2D-v0", "eitbench/Pipe2DSmoothing-v0", "eitbench/Pipe2DInjection-v0"])
-def test_the_spec_says_how_many_steps_there_are(name):
+def test_the_spec_contains_the_number_of_steps(name):
     """The last step of a variant is terminated and not truncated. Gymnasium's
     wrapper around an environment from such a spec changes only the flag truncated."""
     env = gym.make(name, **short(name))

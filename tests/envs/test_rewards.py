@@ -15,7 +15,7 @@ def name(request):
     return request.param
 
 
-def test_action_is_one_number_a_node_and_one_a_parameter_of_the_flow(name):
+def test_action_has_one_number_per_node_and_flow_parameter(name):
     """The action space (n + k,) is symmetric about zero: ten times the expected concentration and velocity."""
     env = make(name)
     task = env.unwrapped.task
@@ -30,7 +30,7 @@ def test_action_is_one_number_a_node_and_one_a_parameter_of_the_flow(name):
     np.testing.assert_array_equal(env.action_space.low, -expected)
 
 
-def test_reward_is_minus_the_relative_error_of_the_state_asked_for(name):
+def test_reward_is_minus_the_relative_error_of_the_requested_state(name):
     """Step i scores the state i − lag after the warm-up; the true state at the nodes has a reward of about 0.
 
     Its reward is the projection error on the coarser mesh, computed here on the truth's mesh; 1.5 times the state has
@@ -101,7 +101,7 @@ def test_reward_has_a_second_term_for_the_flow(name):
         np.testing.assert_array_equal(rewards[:task.warm_up], 0.0)
 
 
-def test_what_is_revealed_is_the_episode(name):
+def test_privileged_info_is_the_episode(name):
     """Oracles receive all observations of the episode and the true flow."""
     base = make(name).unwrapped
     seen = [base.reset(seed=1)[0]]

@@ -68,7 +68,7 @@ def assert_same_play(one, other):
 
 
 @pytest.mark.parametrize(("name", "num_envs"), [(PIPE, 1), *((name, 5) for name in AT_HOME)])
-def test_same_as_so_many_scalar_environments(name, num_envs):
+def test_same_as_scalar_environments(name, num_envs):
     """Over three episodes, two of them after an autoreset, it equals gymnasium's SyncVectorEnv."""
     mine = make(name, num_envs)
     sync = make(name, num_envs, "sync")

@@ -45,7 +45,7 @@ def test_leaderboard_scores_what_is_rewarded(name, said, monkeypatch):
     (PIPE, "Estimate.velocity must be None where the flow is not estimated"),
     (SKEWED, r"Estimate.velocity must have shape \(3,\)"),
 ])
-def test_flow_is_refused_where_it_is_not_asked_for(id, message):
+def test_flow_is_rejected_where_it_is_not_requested(id, message):
     """A velocity is rejected if it is not requested or has too few numbers."""
     base = make(id).unwrapped
     said = Estimate(np.full(base.task.mesh.n_nodes, 31.0), velocity=np.array([4.5]))

@@ -62,7 +62,7 @@ def test_any_memory_layout(kind, layout):
 
 
 @both
-def test_a_column_keeps_its_bits_whatever_stands_beside_it(kind):
+def test_a_column_does_not_depend_on_others(kind):
     """A solution does not depend on the batch, its length, the position, or NaN in other columns."""
     solver = kind(sp.csr_array(random_matrix(200, seed=3)))
     right = np.random.default_rng(4).normal(size=(200, 20))

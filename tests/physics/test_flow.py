@@ -51,7 +51,7 @@ def test_fluid_rests_at_the_walls_and_is_fastest_on_the_axis():
 
 
 @pytest.mark.parametrize("exponent", [1 / 7, 1 / 3, 1.0, 2.0])
-def test_power_law_has_the_mean_it_is_asked_for(exponent):
+def test_power_law_has_the_requested_mean(exponent):
     """(1/R) ∫₀ᴿ v dy = v̄ on both sides, with the variable t = (1 − y/R)^(1/7), in which v is smooth."""
     t, weights = np.polynomial.legendre.leggauss(40)
     t, weights = 0.5 * (t + 1.0), 0.5 * weights

@@ -98,7 +98,7 @@ def test_a_uniform_concentration_is_a_uniform_conductivity(law):
 
 
 @each_law
-def test_concentration_below_the_floor_counts_as_the_floor(law):
+def test_concentration_below_the_minimum_is_replaced(law):
     """Negative and tiny values give a positive σ and the voltages of the minimum concentration, with its slope."""
     model = observation(law)
     c = concentration(model)

@@ -54,7 +54,7 @@ def test_ranks_and_means_by_hand():
     assert tuple(table.loc["homogeneous", ["error", "error_low", "error_high"]]) == pytest.approx((value, low, high))
 
 
-def test_what_cannot_be_told_apart_shares_a_rank():
+def test_methods_without_a_significant_difference_are_tied():
     """Two methods that are better in different episodes both have rank 1."""
     wobble = [1, -1, 1, -1, -1, 1, 1, -1]
     a, b = ([0.1 + sign * 0.01 * w for w in wobble] for sign in (1, -1))
@@ -91,7 +91,7 @@ def test_who_has_no_rank():
     assert table["error"]["failing"] == pytest.approx(np.mean(times(0.1)[:7]))
 
 
-def test_the_episodes_are_those_of_the_floor():
+def test_episodes_are_those_of_the_naive_baseline():
     """More seeds than the naive baseline's change neither means nor completeness; a failure among them does."""
     more = {f"test:{i}": error for i, error in enumerate([*times(0.5), 9.0, 9.0])}
     table = table_of(floor(), record("a", more), record("b", times(0.6)), record("c", more | {"test:9": None}),
@@ -133,7 +133,7 @@ def test_an_environment_with_arguments_has_no_part_in_an_aggregate():
     assert set(table[table["environment"] == name]["method"]) == {"b", "homogeneous"}
 
 
-def test_nobody_s_own_floor_empties_an_aggregate():
+def test_self_reported_baselines_do_not_affect_aggregates():
     """Self-reported baselines add no environment: its two records would exclude all methods without it."""
     honest = [floor(official=True), floor(id=TANK, official=True),
               *(record(name, times(0.5), id=id) for name in "ab" for id in (BOARD_IDS["filter"], TANK))]

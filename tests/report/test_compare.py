@@ -155,7 +155,7 @@ def test_words_follow_from_the_intervals():
     assert (few["better"][0], few["a better"][0], few["advantage of a"][0]) == ("–", "100 %", "0.3")
 
 
-def test_who_is_not_in_the_folder_comes_with_the_package(tmp_path, monkeypatch):
+def test_methods_that_are_not_in_the_folder_are_found_in_the_package(tmp_path, monkeypatch):
     """After a first submission in a user's folder, the method is compared with built-in ones and naive baselines."""
     shipped, own = tmp_path / "shipped", tmp_path / "own"
     monkeypatch.setattr(comparison, "BUNDLED_RECORDS", shipped)
@@ -166,13 +166,13 @@ def test_who_is_not_in_the_folder_comes_with_the_package(tmp_path, monkeypatch):
     assert naive_baseline_records(own) == naive_baseline_records(tmp_path / "nowhere") == [floor]
 
 
-def test_in_a_terminal_lines_are_not_wrapped():
+def test_lines_are_not_wrapped_in_a_terminal():
     """Names are above the table, and omitted columns are named below."""
     a, b = two_methods()
     table = compare(a, b)
     whole, narrow = (format_comparison(table, "a_long_name", "another", "error", letters) for letters in (200, 60))
     assert whole.startswith("A: a_long_name\nB: another\n\n| environment") and "columns omitted" not in whole
-    assert narrow.endswith("columns omitted: episodes, ẽ_c of A, ẽ_c of B, A better")
+    assert narrow.endswith("episodes, ẽ_c of A, ẽ_c of B, A better")
     rows = narrow.split("\n\n")[1].splitlines()
     assert max(map(len, rows)) <= 60
     assert [cell.strip() for cell in rows[0].split("|")] == ["", "environment", "better", "advantage of A", ""]

@@ -55,7 +55,7 @@ def test_a_field_is_drawn_to_scale(name):
     assert len(colours) > 1 or task.mesh.dim == 3        # source, sink and the others; in 3D electrodes in the section
 
 
-def test_a_field_of_another_mesh_is_told():
+def test_a_field_of_another_mesh_is_rejected():
     task = task_of(PIPE)
     with pytest.raises(ValueError, match=rf"c must have shape \({task.mesh.n_nodes},\), got \(3,\)"):
         eitbench.plot.field(task, np.ones(3))

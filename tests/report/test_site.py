@@ -114,6 +114,7 @@ def test_numbers_are_those_of_the_boards(pages):
             for cells, row in zip(cells_of_rows, board.rows, strict=True):
                 rank = row.cells["rank"]
                 assert cells[0].split()[0] == (MISSING if rank is None else str(rank))
+                badges = [BADGES.get(word, word) for word in row.badges]
                 assert all(word in cells[1] for word in [row.cells["title"], row.label,
                                                          *(BADGES.get(word, word) for word in row.badges)])
                 assert ("self-reported" in cells[1]) != row.cells["official"]
@@ -335,7 +336,7 @@ def test_every_link_resolves(site, pages):
     assert links > 50
 
 
-def test_links_beside_the_site(tmp_path):
+def test_links_to_files_of_the_repository(tmp_path):
     """Links to files of the repository exist."""
     folder = tmp_path / "leaderboards"
     for name in (LINKS["Submit a method"], LINKS["Code"], f"{METHODS_FOLDER}/kalman_filter.py", *(

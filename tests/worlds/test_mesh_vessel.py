@@ -56,7 +56,7 @@ def test_electrodes_are_those_of_the_groups(files, vessel):
         np.testing.assert_array_equal(vessel.transport_mesh(fine)[0].points, mesh.points)
 
 
-def test_a_world_of_it_is_played(vessel, monkeypatch):
+def test_a_world_with_it_runs(vessel, monkeypatch):
     """A script can register it, and it runs like other ids; without an inlet it has no inflow."""
     register_apart(monkeypatch)
     world = World("Meshed", vessel, NoFlow(), Cylinders(), schedule=Schedule(

@@ -37,7 +37,7 @@ def test_mean_velocity_is_drawn_evenly_from_its_range(world):
     assert kstest(means, "uniform", (low, high - low)).pvalue > 1e-3
 
 
-def test_estimators_are_told_another_velocity():
+def test_the_task_specifies_another_velocity():
     """The estimator model moves a ramp along the axis by 1.5·v̄ per second with the specified v̄,
     not the drawn one."""
     for assumed, mean in (({}, 4.5), ({"mean_velocity": 2.0}, 2.0)):

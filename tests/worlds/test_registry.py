@@ -55,7 +55,7 @@ def hands() -> list[str]:
     return [each.id for each in registry.runtime_entries()]
 
 
-def test_a_world_is_played_under_its_id():
+def test_a_world_runs_under_its_id():
     """`gymnasium.make` works; in a pipe without slugs the background is the truth."""
     register(QUIET, ID, description="Nothing happens.", lag=1)
     assert list(entries())[-1] == ID
@@ -144,7 +144,7 @@ def test_another_process_takes_over(tmp_path):
     assert done.stdout.strip() == here.tobytes().hex()
 
 
-def test_who_is_told_last_counts():
+def test_the_last_registration_is_used():
     """A process that works for several scripts uses the registration of the current one."""
     register(QUIET, ID)
     registry.import_entries([replace(entry(ID), world=OTHER, settings={"lag": 2})])

@@ -56,7 +56,7 @@ def test_the_task_is_that_of_home(id):
     ("me/Shift-v0", {}, "eitbench/Pipe2DFixedLag-v0", "differ in settings$"),
     ("me/Shift-v0", {}, "eitbench/Pipe2DInjection-v0", "differ in track$"),
 ])
-def test_a_home_where_other_things_are_told_is_refused(id, changes, home, message, monkeypatch):
+def test_a_nominal_environment_with_another_task_is_rejected(id, changes, home, message, monkeypatch):
     register_apart(monkeypatch)
     with pytest.raises(ValueError, match=message):
         register(PIPE_2D.with_changes(changes), id, nominal=home)
@@ -88,7 +88,7 @@ def test_short_slugs_last_half_as_long():
     assert shifted / home == pytest.approx(4.0, rel=0.1)
 
 
-def test_readings_have_twice_the_noise_that_is_told():
+def test_measurements_have_twice_the_specified_noise():
     """Faults of all kinds are drawn as in the nominal environment, with the same fluid."""
     assert PIPE_2D_DOUBLE_NOISE.truth_config == PIPE_2D.truth_config and PIPE_2D_DOUBLE_NOISE.name == PIPE_2D.name
     random = np.random.default_rng(0)
