@@ -1,9 +1,8 @@
 """Build the documentation: `python docs/build.py`, then open build/docs/site/index.html.
 
-Needs the extra `docs`. The pages of docs/ are staged in build/docs/pages with those that are
-generated (environments, methods, reference) and with the notebooks, which are executed. Zensical
-turns them into a site; every link, anchor and picture of it is checked. `--draft` executes no
-notebook.
+Needs the extra `docs`. build/docs/pages gets the pages of docs/, the generated pages
+(environments, methods, reference) and the executed notebooks. Zensical turns them into a site,
+whose links, anchors and pictures are checked. `--draft` does not execute the notebooks.
 """
 
 import argparse
@@ -41,11 +40,11 @@ ELSEWHERE = {
     "leaderboards/site": "boards",
     "studies/README.md": "studies.md",
 }
-"""Where on the site things lie that are not in docs/."""
+"""File or folder outside docs/ -> its page on the site."""
 
 
 def place(source: Path) -> str:
-    """Where a file or folder of the repository lies on the site; what is no page, as a file."""
+    """Return the address on the site of a file or folder of the repository."""
     name = source.relative_to(ROOT).as_posix()
     if name in ELSEWHERE:
         return ELSEWHERE[name]
@@ -56,7 +55,7 @@ def place(source: Path) -> str:
 
 
 def placed(linked: Path) -> str:
-    """Where what a page links to lies on the site; a file that is no page is copied there."""
+    """Return the address on the site of a link target; copy a target that is not a page."""
     page = place(linked)
     if linked.is_file() and not page.endswith(".md"):
         write(page, linked.read_bytes())
@@ -64,7 +63,7 @@ def placed(linked: Path) -> str:
 
 
 def relative(page: str, source: Path) -> str:
-    """The way on the site from the page that ``source`` becomes to another one."""
+    """Return the relative address of ``page`` from the page of ``source``."""
     return os.path.relpath(page, Path(place(source)).parent)
 
 
@@ -109,8 +108,8 @@ def staged_boards(source: Path) -> str:
 
 
 def with_environments(line: re.Match[str]) -> str:
-    """A line in which the ids of our environments, where they are no links, lead to their pages;
-    that of measured records has none."""
+    """Return the line with links from environment ids to their pages, except in links and for
+    measured data, which has no page."""
     def linked(match: re.Match[str]) -> str:
         known = match[1] in entries()
         return f"[{match[0]}](environments/{match[2]}.md)" if known else match[0]
@@ -119,14 +118,14 @@ def with_environments(line: re.Match[str]) -> str:
 
 
 def write(name: str, content: str | bytes) -> None:
-    """A file of the staged pages."""
+    """Write a file of the staged pages."""
     path = PAGES / name
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_bytes(content.encode() if isinstance(content, str) else content)
 
 
 def toml(value: object) -> str:
-    """Strings, lists and dicts of them as TOML, which writes strings as JSON does."""
+    """Return strings, lists and dicts of strings as TOML, whose strings have the form of JSON."""
     if isinstance(value, dict):
         return "{" + ", ".join(f"{toml(key)} = {toml(of)}" for key, of in value.items()) + "}"
     if isinstance(value, list):
@@ -155,7 +154,7 @@ def main() -> None:
 
 
 def stage_written() -> None:
-    """The pages that somebody wrote, and the boards."""
+    """Stage the written pages and the leaderboards."""
     sources = [*sorted((ROOT / "docs").glob("*.md")),
                *(ROOT / name for name in ELSEWHERE if name.endswith(".md") and name != "README.md")]
     for source in sources:
@@ -168,7 +167,7 @@ def stage_written() -> None:
 
 
 def stage_generated(*, execute: bool) -> list[str]:
-    """Environments, methods, the reference and notebooks; gives the names of their files."""
+    """Stage environments, methods, reference and notebooks; return the names of their files."""
     pages = generated.environments() | generated.baselines() | generated.reference()
     for source in sorted((ROOT / "docs" / "notebooks").glob("*.ipynb")):
         began = time.perf_counter()
@@ -189,8 +188,8 @@ def configure(pages: list[str]) -> None:
 
 
 def check_readme() -> None:
-    """`SystemExit` unless README's first snippet prints what README says, but for the last digit
-    of a number, which another processor may round otherwise."""
+    """Raise `SystemExit` unless README's first snippet prints the text in README, up to the last
+    digit of a number, whose rounding depends on the processor."""
     text = (ROOT / "README.md").read_text(encoding="utf-8")
     snippet = re.search(r"^```python\n(.*?)^```$", text, re.DOTALL | re.MULTILINE)
     said = re.search(r"It prints `([^`]*)`", text)
@@ -201,11 +200,11 @@ def check_readme() -> None:
     numbers = [[float(number) for number in re.findall(r"-?\d+\.\d+", words)]
                for words in (said[1], out.getvalue())]
     if any(abs(a - b) > 1.1e-4 for a, b in zip(*numbers, strict=True)):
-        raise SystemExit(f"README.md says {said[1]}, but its snippet prints {out.getvalue()}")
+        raise SystemExit(f"README.md has {said[1]}, but its snippet prints {out.getvalue()}")
 
 
 def expanded(nav: list[object], pages: list[str]) -> list[object]:
-    """The navigation with each "folder/*" replaced by the pages that were generated there."""
+    """Return the navigation with the generated pages in place of each "folder/*"."""
     entries: list[object] = []
     for entry in nav:
         if isinstance(entry, dict):

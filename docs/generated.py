@@ -1,6 +1,6 @@
-"""Pages made from what is there: environments, methods, the reference, and executed notebooks.
+"""Generated pages: environments, methods, the reference, and executed notebooks.
 
-Each function gives the staged files by their names on the site.
+Each function maps names on the site to contents of files.
 """
 
 import csv
@@ -16,7 +16,7 @@ ROOT = Path(__file__).resolve().parent.parent
 REFERENCE = {
     "eitbench": [f"eitbench.{name}" for name in (
         "evaluate", "Task", "Estimate", "make_task", "simulate", "Episode", "World", "Rules",
-        "register", "page", "report.plot", "data.dataset")],
+        "register", "describe_environment", "report.plot", "data.dataset")],
     "eitbench.envs": ["eitbench.envs.estimation.EstimationEnv",
                       "eitbench.envs.injection.InjectionEnv"],
     "eitbench.estimation": ["eitbench.estimation"],
@@ -35,27 +35,27 @@ REFERENCE = {
     "eitbench.rl": ["eitbench.rl.training", "eitbench.rl.agents", "eitbench.rl.vec_env",
                     "eitbench.rl.networks"],
 }
-"""Page of the reference -> what it describes."""
+"""Page of the reference -> modules and names."""
 
 BASELINES = """# Methods
 
-One file each, written as you would write yours, with the public API only. Each page has the code.
-Agents that were trained are described [with the injection worlds](injection.md#trained-agents).
+A method is one file that uses the public API only, like a method of a user. Each page has the code.
+Trained agents are described [with the injection environments](injection.md#trained-agents).
 
 """
-"""How the page that lists the methods begins."""
+"""Introduction of the page that lists the methods."""
 
 Files = dict[str, str | bytes]
 
 
 def scores() -> list[dict[str, str]]:
-    """Rows of the boards of single environments."""
+    """Return the rows of the leaderboards of single environments."""
     with open(ROOT / "leaderboards" / "leaderboard.csv", encoding="utf-8", newline="") as file:
         return [row for row in csv.DictReader(file) if row["environment"] != "all"]
 
 
 def environments() -> Files:
-    """A page for each id of ours: its animation, what it asks for, its board."""
+    """Return a page for each built-in id: animation, description, leaderboard."""
     files: Files = {}
     rows = scores()
     for id in builtin_ids():
@@ -79,7 +79,7 @@ def environments() -> Files:
 
 
 def baselines() -> Files:
-    """A page for each method of ours: what it does, its scores, its code; and the list of them."""
+    """Return a page for each built-in method, with description, scores and code, and their list."""
     files: Files = {}
     rows = scores()
     lists = []
@@ -103,31 +103,31 @@ def baselines() -> Files:
 
 
 def kind(role: str | None, privileged: bool) -> str:
-    """What a method is on a board, where it is not ranked."""
+    """Return why a method has no rank."""
     kinds = []
     if role == "floor":
-        kinds.append("a floor: what knowing next to nothing scores")
+        kinds.append("a naive baseline, without a rank")
     if role == "reference":
-        kinds.append("a reference: about what can be reached")
+        kinds.append("an oracle: an estimate of the attainable error")
     if privileged:
-        kinds.append("it is shown the truth, and has no rank")
+        kinds.append("it uses privileged information, and has no rank")
     return "".join(f" – {each}" for each in kinds)
 
 
 def table(rows: list[dict[str, str]], first: str) -> str:
-    """Ranks and errors of some lines of the boards, named by method or by environment."""
-    lines = ["| | rank | ẽ_c (95 % interval) | gain over the floor |", "|---|---:|---:|---:|"]
+    """Return ranks and errors of rows of the leaderboards, named by method or by environment."""
+    lines = ["| | rank | ẽ_c (95 % interval) | skill score |", "|---|---:|---:|---:|"]
     for row in rows:
         error = format_interval(*(float(row[key] or "nan")
                                 for key in ("error", "error_low", "error_high")))
         gain = f"{float(row['gain']):.2f}" if row["gain"] else "–"
         lines.append(f"| {name_of(row, first)} | {row['rank'] or row['note'] or '–'} | {error} | "
                      f"{gain} |")
-    return "\n".join(lines) if rows else "There is no record yet."
+    return "\n".join(lines) if rows else "No records yet."
 
 
 def name_of(row: dict[str, str], first: str) -> str:
-    """A line's name with a link to its page."""
+    """Return the name of a row with a link to its page."""
     if first == "environment":
         name = row["environment"].removeprefix("eitbench/")
         return f"[{name}](../environments/{name}.md)"
@@ -137,21 +137,19 @@ def name_of(row: dict[str, str], first: str) -> str:
 
 
 def linked(text: str) -> str:
-    """Our pages, where a docstring names their files, as links."""
+    """Return the text with links to the documents whose files it names."""
     return re.sub(r"`+docs/([\w-]+)\.md`+", r"[\1](../\1.md)", text)
 
 
 def reference() -> Files:
-    """The pages of the reference, whose text mkdocstrings takes from docstrings."""
+    """Return the pages of the reference, which mkdocstrings fills from docstrings."""
     return {f"api/{page}.md": f"# {page}\n\n" + "\n\n".join(f"::: {name}" for name in names) + "\n"
             for page, names in REFERENCE.items()}
 
 
 def notebook(source: Path, execute: bool) -> Files:
-    """A notebook as a page with what its cells print and draw; the notebook itself lies beside it.
-
-    Whatever a cell raises ends the build.
-    """
+    """Return a notebook and a page with the output of its cells; an exception in a cell ends the
+    build."""
     import nbformat
     from jupyter_client.manager import AsyncKernelManager
     from nbclient import NotebookClient

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import meshio
 import numpy as np
-from eitbench.numerics.mesh import Mesh, graded, rectangle_mesh
+from eitbench.numerics.mesh import Mesh, graded_interval, rectangle_mesh
 from scipy.integrate import solve_ivp
 from scipy.special import roots_jacobi, spherical_jn
 
@@ -88,8 +88,8 @@ def disc_mesh(radius: float, spans: np.ndarray, cells: int, grading: float = 1.5
     ``spans`` (L, 2) are the electrodes' first and last angles, increasing within [0, 2π).
     """
     edges = np.append(spans.ravel(), spans[0, 0] + 2 * np.pi)
-    angles = np.concatenate([graded(a, b, cells, grading)[:-1] for a, b in pairwise(edges)])
-    mesh = polar_mesh(graded(0.0, radius, 2 * cells, grading, "stop"), angles)
+    angles = np.concatenate([graded_interval(a, b, cells, grading)[:-1] for a, b in pairwise(edges)])
+    mesh = polar_mesh(graded_interval(0.0, radius, 2 * cells, grading, "stop"), angles)
     return mesh, [ring_facets(mesh, radius, tuple(span)) for span in spans]
 
 

@@ -15,7 +15,8 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parent.parent
-FOLDERS: tuple[str, ...] = ()
+FOLDERS = ("eitbench", "baselines", "tests", "docs", "studies", "benchmarks", "examples", "leaderboards", ".github",
+           ".")
 SUFFIXES = {".py", ".md", ".j2", ".js", ".css", ".yml", ".yaml", ".toml", ".ipynb"}
 GENERATED = ("leaderboards/results", "leaderboards/site", "leaderboards/leaderboard.md", "docs/media", "docs/site",
              "tests/test_language.py")
@@ -37,6 +38,8 @@ RULES = {
                 r"|too good|kits?|floors?|witness(?:es)?|diary|recipe)\b(?<!noise floor)(?<!noise floors)",
 }
 """Rule -> regular expression, matched in prose only; case matters."""
+TITLE = "Recurrent network that knows no model of the flow"
+"""Title of a method in published records."""
 NO_PROSE = re.compile(r"```.*?```|`[^`\n]*`|\]\([^)]*\)|https?://\S+|<style.*?</style>|<[^>]*>|\{[%#{].*?[%#}]\}",
                       re.S)
 PARTICIPLE = re.compile(r"[a-z]+ed|shown|kept|given|made|found|drawn|known|told|said|left|held|sent|built|begun|spent")
@@ -69,7 +72,8 @@ def findings(path: Path) -> list[str]:
     name = path.relative_to(ROOT)
     lines = prose_of_python(path.read_text(encoding="utf-8")) if path.suffix == ".py" else prose_of_text(path)
     return [f"{name}:{number}: {rule}: {match.group().strip()!r} in {line.strip()[:90]!r}"
-            for number, line in lines for rule, pattern in RULES.items() for match in re.finditer(pattern, line)]
+            for number, line in lines for rule, pattern in RULES.items()
+            for match in re.finditer(pattern, line.replace(TITLE, ""))]
 
 
 def files(*paths: Path) -> list[Path]:
@@ -87,7 +91,6 @@ def test_prose_keeps_the_rules(folder):
     assert not found, f"{len(found)} findings\n" + "\n".join(found[:50])
 
 
-@pytest.mark.xfail(reason="not all packages are renamed yet")
 def test_no_public_function_is_named_by_a_bare_participle():
     """Functions are verbs; `cached` is the name of the design."""
     names = {f"{path.relative_to(ROOT)}: {node.name}" for path in (ROOT / "eitbench").rglob("*.py")
@@ -96,7 +99,6 @@ def test_no_public_function_is_named_by_a_bare_participle():
     assert not names, "\n".join(sorted(names))
 
 
-@pytest.mark.xfail(reason="not all packages are renamed yet")
 def test_no_constant_is_defined_in_two_modules():
     """A constant's name has one meaning in the package."""
     places = defaultdict(list)

@@ -54,7 +54,7 @@ FIRST_STEPS = 24
 WORLD_EPISODES = {"train:0": FIRST_STEPS, "dev:0": None}
 """Seed -> number of simulated steps of a world's golden episode; None: the whole episode."""
 OBSERVATION_SEEDS = ("train:0", "dev:0", "dev:1")
-QUICK_SEEDS = ("train:0",)
+FAST_EPISODES = ("train:0",)
 """Seed of the only episode that a quick check computes: the shortened one."""
 N_OBSERVATIONS = 3
 """Number of observations for each of these seeds: one from `reset` and two from `step`."""
@@ -195,7 +195,7 @@ def _is_numeric(value: Any) -> bool:
 
 def world_golden(id: str, *, is_quick: bool = False) -> dict[str, Any]:
     """Compute the golden numbers of a registered id: of its world, and its first observations."""
-    episodes, seeds = (QUICK_SEEDS, QUICK_SEEDS) if is_quick else ((*WORLD_EPISODES,),
+    episodes, seeds = (FAST_EPISODES, FAST_EPISODES) if is_quick else ((*WORLD_EPISODES,),
                                                                    OBSERVATION_SEEDS)
     return {"id": id, **world_numbers(entry(id).world, episodes),
             "observations": {seed: first_observations(id, seed) for seed in seeds}}
@@ -233,7 +233,7 @@ def _rounded(value: Any) -> Any:
 def _world_differences(id: str, expected: dict[str, Any], *, is_quick: bool) -> list[str]:
     computed = json.loads(world_text(world_golden(id, is_quick=is_quick)))
     if is_quick:
-        expected = expected | {part: {name: expected[part][name] for name in QUICK_SEEDS}
+        expected = expected | {part: {name: expected[part][name] for name in FAST_EPISODES}
                                for part in ("episodes", "observations")}
     return [f"{id}: {sentence}" for sentence in differences(computed, expected)]
 

@@ -31,7 +31,7 @@ ROLES = (None, "floor", "reference")
 """Role of a method on a leaderboard: ranked, naive baseline, or oracle."""
 
 AGENT_FILES = ("config.json", "sha256")
-"""Files beside the model.zip of an agent."""
+"""Files in the folder of an agent's model.zip."""
 MAX_METHOD_BYTES = 1 << 28
 """size of a method's file"""
 MAX_TITLE_CHARS = 120
@@ -248,8 +248,8 @@ def _named_files(path: Path, source: bytes) -> tuple[str, ...]:
 
 
 def method_sha256(contents: Mapping[str, bytes]) -> str:
-    """Return the sha256 of a method from its `method_files`: that of its file, or of the list of
-    all names and digests if its class names files."""
+    """Return the sha256 of a method from its `method_files`: the digest of its file, or of the list
+    of all names and digests if the class names files."""
     (name, source), *others = contents.items()
     if not others or not name.endswith(".py"):
         return hashlib.sha256(source).hexdigest()
@@ -260,7 +260,7 @@ def method_sha256(contents: Mapping[str, bytes]) -> str:
 
 def find_method(name: str, track: str) -> Path:
     """Return the file of a method by its name, if it is built in or installed, or by its path.
-    ``ValueError`` if there is none, or it has the name of another."""
+    ``ValueError`` if the file is missing, or has the name of another method."""
     form = METHOD_KINDS[track]
     folder = baseline_folder() / form.folder
     own = builtin_methods(track)

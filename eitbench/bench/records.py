@@ -44,7 +44,7 @@ COMMON_FIELDS = ("board", "title", "parameters", "role", "privileged", "version"
 """Fields that all episodes of a record share, in addition to environment and method."""
 MAX_BYTES = 2**23
 """size of a file"""
-MAX_DEPTH = 32
+MAX_RECORD_DEPTH = 32
 """levels of nested lists and objects"""
 MAX_KWARGS_CHARS = 10_000
 """length of an environment's arguments as JSON, which become headings"""
@@ -98,7 +98,7 @@ def read_json(path: Path) -> Any:
         if not stat.S_ISREG(status.st_mode) or status.st_size > MAX_BYTES:
             raise ValueError(f"it must be a file of at most {MAX_BYTES >> 20} MiB")
         content = orjson.loads(path.read_bytes())
-        _check.depth("lists and objects", content, MAX_DEPTH)
+        _check.depth("lists and objects", content, MAX_RECORD_DEPTH)
     except (OSError, ValueError) as error:
         raise ValueError(f"cannot be read: {error}") from None
     return content

@@ -97,14 +97,14 @@ class Table(NamedTuple):
         widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
         words = [kind == "words" for kind in self.column_styles]
 
-        def padded(line: list[str]) -> str:
+        def pad(line: list[str]) -> str:
             cells = (text.ljust(width) if left else text.rjust(width)
                      for text, width, left in zip(line, widths, words, strict=True))
             return f"| {' | '.join(cells)} |"
 
         rule = "|".join("-" * (width + 2) if left else "-" * (width + 1) + ":"
                         for width, left in zip(widths, words, strict=True))
-        return "\n".join([padded(lines[0]), f"|{rule}|", *map(padded, lines[1:])])
+        return "\n".join([pad(lines[0]), f"|{rule}|", *map(pad, lines[1:])])
 
 
 def number_cell(value: float | None) -> Cell:

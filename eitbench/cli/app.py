@@ -244,7 +244,7 @@ REPLACED = {
 """Removed command -> replacement."""
 
 
-def removed(context: typer.Context) -> None:
+def report_removed(context: typer.Context) -> None:
     """Print the replacement of a removed command."""
     name = str(context.info_name)
     options.echo(f"`eitbench {name}` was removed: use `{REPLACED[name]}`", err=True)
@@ -253,7 +253,7 @@ def removed(context: typer.Context) -> None:
 
 for _name in REPLACED:
     app.command(_name, hidden=True, add_help_option=False, context_settings={
-        "allow_extra_args": True, "ignore_unknown_options": True})(removed)
+        "allow_extra_args": True, "ignore_unknown_options": True})(report_removed)
 
 if __name__ == "__main__":
     app()

@@ -193,7 +193,7 @@ class OpenLoopCovariance:
             left = _signed_factor(initial - self.limit, self._threshold)
         self._transients = [left]  # (U, D) at t = 0, 1, …
 
-    def scaled(self, factor: float) -> OpenLoopCovariance:
+    def scale_by(self, factor: float) -> OpenLoopCovariance:
         """Return the same sequence times ``factor``, sharing all matrices."""
         other = object.__new__(OpenLoopCovariance)
         other.__dict__ = self.__dict__ | {"scale": self.scale * factor}

@@ -101,18 +101,18 @@ class EnsembleFilter:
     def _carried(self, before: np.ndarray, after: np.ndarray) -> np.ndarray:
         """Return the concentrations (n, N) one time step later, each in its member's velocity."""
 
-        def moved(theta: np.ndarray) -> np.ndarray:
+        def move(theta: np.ndarray) -> np.ndarray:
             return self.flow.transport_at(theta).step(self.concentration, before, after)
 
         theta = self.parameters.mean(axis=1)
         spread = QUADRATURE_NODE * self.parameters.std(axis=1, ddof=1)
-        middle = moved(theta)
+        middle = move(theta)
         carried = middle.copy()
         for axis in np.flatnonzero(spread):
             offset = np.zeros_like(theta)
             offset[axis] = spread[axis]
-            more = moved(theta + offset) - middle
-            less = moved(theta - offset) - middle
+            more = move(theta + offset) - middle
+            less = move(theta - offset) - middle
             s = (self.parameters[axis] - theta[axis]) / spread[axis]
             carried += 0.5 * s * (more - less) + 0.5 * s**2 * (more + less)
         return carried

@@ -210,7 +210,7 @@ def table_5_1_filter(transport: Transport, prior: Prior, c_ref: float, *,
 def _flowing_states(transport: Transport, prior: Prior, c_ref: float,
                     rank_tolerance: float = FILTER_RANK_TOLERANCE) -> NodalStates:
     F, Y, _ = transport.evolution_model()
-    covariance = LowRankCovariance(_open_loop(transport, prior).scaled(c_ref**2), rank_tolerance)
+    covariance = LowRankCovariance(_open_loop(transport, prior).scale_by(c_ref**2), rank_tolerance)
     return NodalStates(np.full(len(F), c_ref), covariance, Motion(F, Y.sum(axis=1) * c_ref))
 
 

@@ -241,7 +241,7 @@ def rectangle_mesh(x: Sequence[float] | np.ndarray, y: Sequence[float] | np.ndar
     return Mesh(points, np.concatenate([first, second], axis=1).reshape(-1, 3))
 
 
-def graded(start: float, stop: float, cells: int, grading: float,
+def graded_interval(start: float, stop: float, cells: int, grading: float,
            ends: str = "both") -> np.ndarray:
     """Return ``cells + 1`` coordinates, denser towards ``ends`` ("start", "stop" or "both").
 
@@ -273,9 +273,9 @@ def graded_line(length: float, name: str, spans: np.ndarray, cells: int,
         raise ValueError(f"{name} must increase, keep a gap between electrodes and lie inside the "
                          f"pipe, 0 … {length:g} m, got {spans!r}")
     half = max(1, cells // 2)
-    lines = [graded(0.0, edges[0], half, grading, "stop")]
-    lines += [graded(a, b, cells, grading) for a, b in itertools.pairwise(edges)]
-    lines += [graded(edges[-1], length, half, grading, "start")]
+    lines = [graded_interval(0.0, edges[0], half, grading, "stop")]
+    lines += [graded_interval(a, b, cells, grading) for a, b in itertools.pairwise(edges)]
+    lines += [graded_interval(edges[-1], length, half, grading, "start")]
     return np.concatenate([line[:-1] for line in lines] + [[length]])
 
 
@@ -296,10 +296,9 @@ def graded_pipe_mesh(length: float, half_width: float, electrode_spans: np.ndarr
     cells_across : int
         Cells from wall to wall.
     grading : (float, float)
-        Exponents of the refinement towards electrode edges and walls, see `graded`; among the tried
-        values the default has the smallest voltage error for random slugs at equal numbers of
-        unknowns.
+        Exponents of the refinement towards electrode edges and walls, see `graded_interval`; the
+        default had the smallest voltage error for random slugs at equal numbers of unknowns.
     """
     along, across = grading
     x = graded_line(length, "electrode_spans", electrode_spans, cells_along, along)
-    return rectangle_mesh(x, graded(-half_width, half_width, cells_across, across))
+    return rectangle_mesh(x, graded_interval(-half_width, half_width, cells_across, across))

@@ -12,7 +12,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from eitbench import _check
-from eitbench.numerics.mesh import Mesh, check_increasing, graded, graded_line
+from eitbench.numerics.mesh import Mesh, check_increasing, graded_interval, graded_line
 
 TWO_PI = 2.0 * np.pi
 
@@ -114,10 +114,10 @@ def electrode_disc(radius: float, spans: np.ndarray, cells_at_electrodes: int, r
     rings : int
         Cells from the centre to the wall.
     grading : (float, float)
-        Exponents of the clustering towards the electrode edges and towards the wall, see `graded`;
-        with 16 electrodes the default is within a few per cent of the smallest voltage error at
-        equal numbers of unknowns. Angles stay above 15° where the wall's cells are about as long as
-        the rings next to them are wide.
+        Exponents of the clustering towards the electrode edges and towards the wall, see
+        `graded_interval`; with 16 electrodes the default is within a few per cent of the smallest
+        voltage error at equal numbers of unknowns. Angles stay above 15° where the wall's cells are
+        about as long as the rings next to them are wide.
     """
     _check.number("radius", radius, low=0.0, open_low=True, units="m")
     _check.integer("cells_at_electrodes", cells_at_electrodes, low=1)
@@ -128,9 +128,10 @@ def electrode_disc(radius: float, spans: np.ndarray, cells_at_electrodes: int, r
     if len(edges) == 0 or (np.diff(closed) <= 0).any():
         raise ValueError("spans must hold at least one electrode, increase, keep a gap between "
                          f"electrodes and lie within one turn, got {spans!r}")
-    lines = [graded(a, b, cells_at_electrodes, around) for a, b in itertools.pairwise(closed)]
+    lines = [graded_interval(a, b, cells_at_electrodes, around)
+             for a, b in itertools.pairwise(closed)]
     wall = np.concatenate([line[:-1] for line in lines])
-    radii = graded(0.0, radius, rings, across, "stop")
+    radii = graded_interval(0.0, radius, rings, across, "stop")
     angles = [wall]
     for r, step in zip(radii[-2:0:-1], np.diff(radii)[-2::-1], strict=True):
         count = min(len(angles[-1]), max(6, round(TWO_PI * r / step)))
@@ -188,7 +189,7 @@ def round_pipe_mesh(length: float, radius: float, spans_around: np.ndarray,
     rings : int
         Cells from the axis to the wall.
     grading : (float, float, float)
-        Exponents of the refinement around, across and along the pipe, see `graded`.
+        Exponents of the refinement around, across and along the pipe, see `graded_interval`.
     """
     _check.number("length", length, low=0.0, open_low=True, units="m")
     around, along = cells_at_electrodes

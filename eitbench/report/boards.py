@@ -110,7 +110,7 @@ class MethodRow(NamedTuple):
         return tuple(filter(None, self.cells["note"].split(", ")))
 
     @property
-    def unranked(self) -> bool:
+    def has_no_rank(self) -> bool:
         """True for a naive baseline, an oracle or a privileged method."""
         return not {"floor", "reference", "privileged"}.isdisjoint(self.badges)
 

@@ -105,11 +105,11 @@ def compare(a: list[dict[str, Any]], b: list[dict[str, Any]], score: str = "erro
     Returns
     -------
     DataFrame
-        environment, score (or `SKILL_SCORE`), episodes; a, b: means; advantage: by how much a is
-        better, b − a of scores of which less is better, else a − b, with the ends of its 95 %
-        interval; better: fraction of episodes in which a is better (an equal score counts ½), with
-        the ends of its interval. Over several environments interquartile means of skill scores, or
-        means of the environments' means.
+        environment, score (or `SKILL_SCORE`), episodes; a, b: means; advantage of a: b − a if
+        lower scores are better, else a − b, with the ends of its 95 % interval; better: fraction of
+        episodes in which a is better (an equal score counts ½), with the ends of its interval. Over
+        several environments interquartile means of skill scores, or means of the environments'
+        means.
 
     Raises
     ------

@@ -70,7 +70,7 @@ def group_by_agent(board: Leaderboard) -> list[AgentRow]:
     groups: dict[tuple[str, bool], list[MethodRow]] = {}
     for row in board.rows:
         method = row.cells["method"]
-        if agent_name(method) != method and not row.unranked:
+        if agent_name(method) != method and not row.has_no_rank:
             groups.setdefault((agent_name(method), row.cells["official"]), []).append(row)
     together = [AgentRow(_agent_mean(board, rows), rows) for rows in groups.values()
                 if sum(row.is_ranked for row in rows) > 1]
@@ -195,7 +195,7 @@ def author_badges(row: MethodRow) -> list[str]:
 
 def filter_flags(row: MethodRow) -> str:
     """Return the flags for the filters of a page."""
-    return " ".join([*author_badges(row), *["unranked"] * row.unranked])
+    return " ".join([*author_badges(row), *["unranked"] * row.has_no_rank])
 
 
 # -- tables ----------------------------------------------------------------------------------------
@@ -390,9 +390,9 @@ def _highlighted_rows(rows: list[MethodRow]) -> list[MethodRow]:
     row for each agent."""
     if len(rows) <= MAX_CURVES:
         return rows
-    chosen = [row for row in rows if row.unranked][:2]
+    chosen = [row for row in rows if row.has_no_rank][:2]
     kinds: dict[str, MethodRow] = {}
     for row in rows:
-        if not row.unranked:
+        if not row.has_no_rank:
             kinds.setdefault(agent_name(row.cells["method"]), row)
     return chosen + list(kinds.values())[:N_HIGHLIGHTED - len(chosen)]

@@ -13,7 +13,7 @@ import pytest
 from eitbench.bench.records import (
     BOARDS,
     MAX_BYTES,
-    MAX_DEPTH,
+    MAX_RECORD_DEPTH,
     read_record,
     read_records,
     record_file_name,
@@ -293,7 +293,7 @@ def test_the_arguments_agree_with_the_environments():
 
 
 @pytest.mark.parametrize("text", ["1e999", "-1e999", "NaN", "Infinity", "9" * 400, "9" * 5000, '"\\ud800"',
-                                  "[" * MAX_DEPTH + "]" * MAX_DEPTH, "[" * 50_000 + "]" * 50_000])
+                                  "[" * MAX_RECORD_DEPTH + "]" * MAX_RECORD_DEPTH, "[" * 50_000 + "]" * 50_000])
 @pytest.mark.parametrize("place", ['"parameters": {"a": 7}', '"seconds": 7', '"error": 7'])
 def test_values_that_json_lacks_are_reported_with_the_file(text, place, tmp_path):
     """Numbers that are not finite, half a character, and lists that are nested too deeply are rejected everywhere."""

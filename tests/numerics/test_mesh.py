@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from eitbench.numerics.fem import mass_matrix, stiffness_matrix
-from eitbench.numerics.mesh import Mesh, graded, graded_pipe_mesh, rectangle_mesh
+from eitbench.numerics.mesh import Mesh, graded_interval, graded_pipe_mesh, rectangle_mesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
@@ -196,7 +196,7 @@ def test_rectangle_mesh_is_symmetric():
        ends=st.sampled_from(["both", "start", "stop"]))
 def test_graded(start, length, cells, grading, ends):
     """cells + 1 increasing coordinates with exact end points; the crowded ends have the smallest cells."""
-    line = graded(start, start + length, cells, grading, ends)
+    line = graded_interval(start, start + length, cells, grading, ends)
     assert len(line) == cells + 1
     assert line[0] == start and line[-1] == pytest.approx(start + length, rel=1e-14)
     size = np.diff(line)
@@ -210,12 +210,12 @@ def test_graded(start, length, cells, grading, ends):
 
 def test_graded_exponent():
     """The exponent applies to the distance from the refined end; 1 is uniform; both ends are symmetric."""
-    assert_allclose(graded(0.0, 4.0, 4, 2.0, "start"), [0.0, 0.25, 1.0, 2.25, 4.0])
-    assert_allclose(graded(0.0, 4.0, 4, 2.0, "stop"), [0.0, 1.75, 3.0, 3.75, 4.0])
-    assert_allclose(graded(0.0, 4.0, 4, 2.0), [0.0, 0.5, 2.0, 3.5, 4.0])
-    assert_allclose(graded(1.0, 3.0, 5, 1.0), np.linspace(1.0, 3.0, 6))
+    assert_allclose(graded_interval(0.0, 4.0, 4, 2.0, "start"), [0.0, 0.25, 1.0, 2.25, 4.0])
+    assert_allclose(graded_interval(0.0, 4.0, 4, 2.0, "stop"), [0.0, 1.75, 3.0, 3.75, 4.0])
+    assert_allclose(graded_interval(0.0, 4.0, 4, 2.0), [0.0, 0.5, 2.0, 3.5, 4.0])
+    assert_allclose(graded_interval(1.0, 3.0, 5, 1.0), np.linspace(1.0, 3.0, 6))
     with pytest.raises(ValueError, match="ends must be 'start', 'stop' or 'both', got 'middle'"):
-        graded(0.0, 1.0, 3, 2.0, "middle")
+        graded_interval(0.0, 1.0, 3, 2.0, "middle")
 
 
 def test_graded_pipe_mesh():
@@ -234,8 +234,8 @@ def test_graded_pipe_mesh():
     # Each direction has its own exponent.
     mesh = graded_pipe_mesh(0.5, 0.05, spans, 6, 8, grading=(3.0, 1.5))
     x, y = np.unique(mesh.points[:, 0]), np.unique(mesh.points[:, 1])
-    assert_allclose(x[3:10], graded(0.1, 0.2, 6, 3.0), rtol=1e-12)
-    assert_allclose(y, graded(-0.05, 0.05, 8, 1.5), atol=1e-15)
+    assert_allclose(x[3:10], graded_interval(0.1, 0.2, 6, 3.0), rtol=1e-12)
+    assert_allclose(y, graded_interval(-0.05, 0.05, 8, 1.5), atol=1e-15)
 
 
 # -- errors -----------------------------------------------------------------------------------------------------------

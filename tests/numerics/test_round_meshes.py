@@ -7,7 +7,7 @@ import re
 import numpy as np
 import pytest
 from eitbench.numerics.fem import mass_matrix
-from eitbench.numerics.mesh import Mesh, graded, rectangle_mesh
+from eitbench.numerics.mesh import Mesh, graded_interval, rectangle_mesh
 from eitbench.numerics.round_meshes import disc_mesh, electrode_disc, extrude, round_pipe_mesh, uniform_disc
 from numpy.testing import assert_allclose, assert_array_equal
 
@@ -100,7 +100,7 @@ def test_electrode_disc(spans, cells, rings, smallest):
     edges = R * np.stack([np.cos(spans.ravel()), np.sin(spans.ravel())], axis=1)
     assert_allclose(on_wall[::cells], edges, atol=1e-15)
     first = np.linalg.norm(np.diff(on_wall[:cells + 1], axis=0), axis=1)               # cells on the first electrode
-    assert_allclose(2 * R * np.sin(np.diff(graded(*spans[0], cells, 2.0)) / 2), first, rtol=1e-10)
+    assert_allclose(2 * R * np.sin(np.diff(graded_interval(*spans[0], cells, 2.0)) / 2), first, rtol=1e-10)
     radii, counts = np.unique(np.round(np.linalg.norm(mesh.points, axis=1), 12), return_counts=True)
     assert len(radii) == rings + 1 and (np.diff(counts) >= 0).all()
     assert np.diff(radii).argmin() == rings - 1
@@ -168,7 +168,7 @@ def test_round_pipe_mesh():
     corner = mesh.points[mesh.facets_where(lambda points: on_electrode)]
     assert len(corner) == 2 * 3 * 4
     area = 0.5 * np.linalg.norm(np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]), axis=1)
-    chords = 2 * R * np.sin(np.diff(graded(*SPANS[2], 3, 2.0)) / 2)
+    chords = 2 * R * np.sin(np.diff(graded_interval(*SPANS[2], 3, 2.0)) / 2)
     assert_allclose(area.sum(), 0.04 * chords.sum(), rtol=1e-10)
 
 

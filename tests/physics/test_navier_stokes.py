@@ -8,7 +8,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 from eitbench.numerics.fem import mass_matrix
-from eitbench.numerics.mesh import Mesh, graded, rectangle_mesh
+from eitbench.numerics.mesh import Mesh, graded_interval, rectangle_mesh
 from eitbench.physics.flow import PlaneChannelFlow
 from eitbench.physics.navier_stokes import SteadyFlow, steady_flow
 from numpy.testing import assert_allclose, assert_array_equal
@@ -62,7 +62,7 @@ def gradients_at_middles(flow):
 
 def cavity(cells, viscosity, grading=1.5, turn=0.0, lid_last=False):
     """Return the flow in the unit square under a lid of unit speed, rotated by an angle about its corner."""
-    line = graded(0.0, 1.0, cells, grading)
+    line = graded_interval(0.0, 1.0, cells, grading)
     square = rectangle_mesh(line, line)
     lid = side(square, 1, 1.0)
     rest = np.array([facet for facet in square.boundary_facets.tolist() if facet not in lid.tolist()])

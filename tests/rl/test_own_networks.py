@@ -164,7 +164,7 @@ def test_a_method_is_its_file_and_the_files_it_names(policy, tmp_path):
 
 
 def test_a_torch_estimator_reads_its_weights(tmp_path):
-    """From weights to a record."""
+    """Weights in a file become a record."""
     env = gym.make(FILTER, **SHORT)
     shape = env.action_space.shape[0], env.observation_space["voltages"].shape[0]
     matrix = torch.full(shape, 1e-3, dtype=torch.float64)
