@@ -76,7 +76,7 @@ function filtering(form) {
       const own = [...section.querySelectorAll(".block")];
       section.hidden = own.length > 0 && own.every((block) => block.hidden);
     }
-    form.querySelector("output").textContent = `${shown} of ${all} lines`;
+    form.querySelector("output").textContent = `${shown} of ${all} rows`;
   };
   for (const box of form.querySelectorAll("input[type=checkbox]")) {      // no choice where there is nothing to hide
     box.parentElement.hidden = !document.querySelector(`[data-flags~="${box.name}"]`);
@@ -120,7 +120,7 @@ function explanations() {
   if (!headers.length || !tip.showPopover) return;      // an older browser shows the title
   tip.className = "tip";
   tip.popover = "manual";
-  tip.ariaHidden = "true";                              // the button says it too
+  tip.ariaHidden = "true";                              // the button has the same description
   document.body.append(tip);
   headers.forEach((header) => explaining(tip, header));
 }
@@ -130,7 +130,7 @@ function pausing(button) {               // puts the still picture in the place 
   const image = picture.querySelector("img");
   const moving = image.getAttribute("src");
   let moves = !matchMedia("(prefers-reduced-motion: reduce)").matches;
-  const show = () => { button.textContent = moves ? "Stop the picture" : "Play the picture"; };
+  const show = () => { button.textContent = moves ? "Pause" : "Play"; };
   button.addEventListener("click", () => {
     picture.querySelector("source")?.remove();
     moves = !moves;
