@@ -39,7 +39,8 @@ class MeshData(NamedTuple):
 
 def read_mesh(path: str | PathLike[str], sha256: str | None = None, *,
               scale: float = 1.0) -> MeshData:
-    """Read a mesh of triangles (in the plane z = 0) or tetrahedra, and its named boundary facets.
+    """Read a mesh of triangles (in a plane z = constant) or tetrahedra, and its named boundary
+    facets.
 
     Nodes keep the file's order; nodes of no cell are dropped. Groups of other dimensions, such as
     the fluid, are ignored.
@@ -70,8 +71,10 @@ def read_mesh(path: str | PathLike[str], sha256: str | None = None, *,
     # gmsh 2.2 writes a cell of two groups twice.
     _, first = np.unique(np.sort(cells, axis=1), axis=0, return_index=True)
     used, numbers = np.unique(cells[np.sort(first)], return_inverse=True)
-    if np.abs(content.points[used, dim:]).max(initial=0.0) > 1e-12 * np.ptp(content.points):
-        raise ValueError(f"{path}: triangles must lie in the plane z = 0")
+    if np.ptp(content.points[used, dim:], axis=0).max(initial=0.0) > 1e-12 * np.ptp(
+            content.points):
+        raise ValueError(f"{path}: triangles must lie in a plane z = constant")
+    _check_distinct(path, content.points, used)
     try:
         mesh = Mesh(scale * np.asarray(content.points[used, :dim], dtype=float),
                     numbers.reshape(-1, dim + 1))
@@ -87,6 +90,15 @@ def read_mesh(path: str | PathLike[str], sha256: str | None = None, *,
             raise ValueError(f"{path}: group {name!r} must lie on the boundary, got "
                              f"{len(outside)} of {len(facets)} facets that do not")
     return MeshData(mesh, groups)
+
+
+def _check_distinct(path: Path, points: np.ndarray, used: np.ndarray) -> None:
+    """Raise ``ValueError``, with their coordinates, for nodes of cells at the same place."""
+    places, counts = np.unique(points[used], axis=0, return_counts=True)
+    if len(same := places[counts > 1]):
+        named = ", ".join(f"({', '.join(f'{value:g}' for value in place)})" for place in same[:3])
+        raise ValueError(f"{path}: nodes must have different coordinates, got several at {named}; "
+                         "in gmsh, `Coherence Mesh;` merges them")
 
 
 def _check_file(path: Path, sha256: str | None) -> None:

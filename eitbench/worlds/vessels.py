@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import TYPE_CHECKING
@@ -310,8 +311,8 @@ class MeshVessel:
     """A vessel with meshes of another program such as gmsh; see `eitbench.numerics.mesh_files`.
 
     Concentration and potential have the same mesh. The truth has a finer mesh than the estimator
-    model, to avoid an inverse crime. The boundary facets of electrode l = 0 … L−1 are the group
-    "electrode l", the facets of an inlet the group "inlet".
+    model, to avoid an inverse crime. The boundary facets of electrode l are the group "electrode l"
+    or "electrode_l", with numbers from 0 or from 1; the facets of an inlet are the group "inlet".
     """
 
     truth_mesh_file: str
@@ -353,11 +354,14 @@ class MeshVessel:
     def electrode_model(self, fine: bool) -> CompleteElectrodeModel:
         from eitbench.physics.cem import CompleteElectrodeModel
         mesh, groups = self._read(fine)
-        names = [f"electrode {number}" for number in range(self.n_electrodes)]
-        if missing := [name for name in names if name not in groups]:
+        numbered = {int(match[1]): facets for name, facets in groups.items()
+                    if (match := re.fullmatch(r"electrode[ _-]?(\d+)", name, re.IGNORECASE))}
+        first = 0 if 0 in numbered else 1
+        numbers = range(first, first + self.n_electrodes)
+        if missing := [f"electrode {number}" for number in numbers if number not in numbered]:
             raise ValueError(f"{self._file(fine)[0]}: must have a group for each electrode, got "
                              f"none for {', '.join(missing)}; there are {', '.join(groups)}")
-        electrodes = [groups[name] for name in names]
+        electrodes = [numbered[number] for number in numbers]
         return CompleteElectrodeModel(mesh, electrodes, self.contact_impedance)
 
     def _file(self, fine: bool) -> tuple[str, str]:

@@ -180,6 +180,14 @@ def test_gmsh_22(tmp_path):
     assert_array_equal(groups["walls"], [[0, 3], [1, 2]])
 
 
+def test_a_plane_elsewhere(tmp_path):
+    """A mesh in the plane z = 5 is the same as in the plane z = 0."""
+    text = re.sub(r"^(\d+ \d \d) 0$", r"\1 5", SQUARE, flags=re.M)
+    assert text != SQUARE
+    moved, mesh = (read_mesh(written(tmp_path, each)).mesh for each in (text, SQUARE))
+    np.testing.assert_array_equal(moved.points, mesh.points)
+
+
 def test_gmsh_41(tmp_path):
     """A curve may be in two groups, and run against its group's direction."""
     mesh, groups = read_mesh(written(tmp_path, SQUARE_41))
@@ -216,7 +224,8 @@ def with_elements(*elements: str) -> str:
     (with_elements("4 2 3 1 20 30 50 60", "5 2 3 1 20 30 40 50 20 30 40 50"), "got hexahedron, line, tetra"),
     (with_elements("9 2 3 1 20 30 40 10 10 10"), "got line, triangle6"),
     (with_elements("2 2 3 1 20 30 40", "8 2 1 1 20 30 10"), "got line, line3, triangle"),
-    (with_elements("2 2 3 1 20 30 40", "2 2 3 1 20 40 60"), "in the plane z = 0"),
+    (with_elements("2 2 3 1 20 30 40", "2 2 3 1 20 40 60"), "in a plane z = constant"),
+    (SQUARE.replace("40 2 1 0", "40 2 0 0"), r"nodes must have different coordinates, got several at \(2, 0, 0\)"),
     (with_elements("2 2 3 1 20 30 30"), "cells must have a positive volume"),
     (with_elements("2 2 3 1 20 30 40"),
      "group 'electrode 1' must lie on the boundary, got 1 of 2 facets that do not"),

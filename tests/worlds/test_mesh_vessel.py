@@ -56,6 +56,18 @@ def test_electrodes_are_those_of_the_groups(files, vessel):
         np.testing.assert_array_equal(vessel.transport_mesh(fine)[0].points, mesh.points)
 
 
+@pytest.mark.parametrize("name", ["electrode_{}", "Electrode {}", "electrode-{}", "electrode{}"])
+def test_electrodes_may_count_from_one(name, files, vessel, tmp_path):
+    """Other spellings of the groups give the same model."""
+    mesh = files["coarse"][2]
+    path = tmp_path / "named.msh"
+    write_mesh(path, mesh, {name.format(l + 1): facets for l, facets in enumerate(TANK.electrodes(mesh))})
+    sigma = np.full(mesh.n_nodes, 0.3)
+    named = RoundMeshVessel(*[str(path), hashlib.sha256(path.read_bytes()).hexdigest()] * 2, 8)
+    np.testing.assert_array_equal(named.electrode_model(False).transfer_resistance(sigma),
+                                  vessel.electrode_model(False).transfer_resistance(sigma))
+
+
 def test_a_world_with_it_runs(vessel, monkeypatch):
     """A script can register it, and it runs like other ids; without an inlet it has no inflow."""
     register_apart(monkeypatch)
