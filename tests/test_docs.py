@@ -43,8 +43,8 @@ def test_links_lead_somewhere(page):
 
 
 def test_readme_is_short():
-    """README has less than 120 lines."""
-    assert len((ROOT / "README.md").read_text(encoding="utf-8").splitlines()) < 120
+    """README has less than 130 lines."""
+    assert len((ROOT / "README.md").read_text(encoding="utf-8").splitlines()) < 130
 
 
 def test_an_estimator_reads_voltages_of_ones_own(capsys):

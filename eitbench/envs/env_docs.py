@@ -46,6 +46,10 @@ def describe_environment(id: str) -> str:
     return "\n\n".join(parts) + "\n"
 
 
+page = describe_environment
+"""Name in earlier versions."""
+
+
 def _overview(env: Any) -> str:
     """Return a table of the sizes of an environment."""
     world = env.world
