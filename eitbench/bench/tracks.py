@@ -28,8 +28,8 @@ CATEGORIES = ("filter", "fixed-lag", "smoothing", "stationary", "injection")
 NAIVE_BASELINES = {"estimation": "homogeneous", "injection": "random_pair"}
 """Naive baselines: they define a leaderboard's episodes and the zero of its skill score."""
 ENV_KWARGS = {
-    "estimation": ("world", "lag", "assume", "episodes", "render_mode"),
-    "injection": ("world", "estimator", "observation", "gate", "inflow", "episodes",
+    "estimation": ("world", "lag", "assume", "episodes", "split", "render_mode"),
+    "injection": ("world", "estimator", "observation", "gate", "inflow", "episodes", "split",
                   "render_mode")}
 """Arguments of the environments of each track."""
 ONBOARD_FILTERS = ("full", "reduced")
@@ -75,10 +75,11 @@ class Environment(NamedTuple):
 
     @property
     def arguments(self) -> dict[str, Any]:
-        """Return all arguments with which it is made, including defaults."""
+        """Return all arguments with which it is made, including defaults, but not the split of
+        unseeded resets, which a run does not have."""
         creator = load_env_creator(str(gym.spec(self.id).entry_point))
         defaults = {name: each.default for name, each in signature(creator).parameters.items()
-                    if each.default is not Parameter.empty and name != "variant"}
+                    if each.default is not Parameter.empty and name not in ("variant", "split")}
         return (defaults | registered_kwargs(self.id) | RUN_KWARGS[self.track]
                 | json.loads(self.kwargs))
 

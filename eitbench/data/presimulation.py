@@ -19,12 +19,15 @@ from eitbench.data.episode_cache import (
 )
 from eitbench.data.episodes import simulate_batch
 from eitbench.data.parallel import run_parallel
+from eitbench.data.seeds import SPLITS
 from eitbench.worlds.world import Flow, World
 
 BATCH_SIZE = 8
 """Episodes in a batch of `simulate_batch`."""
 MAX_EPISODES = 1000
 """Largest number of training episodes of a growing sampler."""
+DEV_EPISODES = 32
+"""Episodes of the split dev from which unseeded resets draw, as many as training evaluates."""
 SINGLE_EPISODE_RESETS = 4
 """First resets, which all begin ``train:0``."""
 RESETS_PER_EPISODE = 8
@@ -83,17 +86,22 @@ def _simulate_and_store(world: World, seeds: Sequence[int], folder: Path,
 
 
 class EpisodeSampler:
-    """Sampler of the training episodes of unseeded resets.
+    """Sampler of the episodes of unseeded resets, training episodes or those of the ``split`` dev.
 
-    It draws from ``episodes`` episodes. If that is None, the number grows with the resets since the
+    It draws from the first ``episodes`` episodes, for dev by default from `DEV_EPISODES`. For
+    training the number grows by default with the resets since the
     last seeded one, so that training starts before all are simulated: 1 for the first
     `SINGLE_EPISODE_RESETS` resets, then the largest power of two that is at most 1/8 of the number
     of resets, from 8 up to `MAX_EPISODES`. Cached episodes have no influence.
     """
 
-    def __init__(self, episodes: int | None) -> None:
-        self.grows = episodes is None
-        self.max_episodes = (MAX_EPISODES if episodes is None
+    def __init__(self, episodes: int | None, split: str = "train") -> None:
+        if split not in ("train", "dev"):
+            raise ValueError(f"split must be train or dev, got {split!r}")
+        self._first = SPLITS[split].start
+        self.grows = episodes is None and split == "train"
+        default = MAX_EPISODES if self.grows else DEV_EPISODES
+        self.max_episodes = (default if episodes is None
                              else _check.integer("episodes", episodes, low=1))
         self._can_store = True
         self.reset()
@@ -112,7 +120,7 @@ class EpisodeSampler:
         """Draw the seed of the next episode."""
         self._n_candidates = self.size
         self._resets += 1
-        return int(random.integers(self._n_candidates))
+        return self._first + int(random.integers(self._n_candidates))
 
     def reset(self) -> None:
         """Restart the growth, after a seeded reset."""

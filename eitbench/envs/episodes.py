@@ -143,10 +143,11 @@ class EpisodeEnv(FixedLengthEnv):
     core: EpisodeCore
     _task_options: dict[str, Any] = {}  # noqa: RUF012 (replaced, not changed)
 
-    def __init__(self, core: EpisodeCore, episodes: int | None, render_mode: str | None) -> None:
+    def __init__(self, core: EpisodeCore, episodes: int | None, split: str,
+                 render_mode: str | None) -> None:
         self.check_render(render_mode)
-        self.pool = EpisodeSampler(episodes)
-        """training episodes of unseeded resets"""
+        self.pool = EpisodeSampler(episodes, split)
+        """episodes of unseeded resets"""
         self.core = core
         """simulates the episode; its results include the ground truth"""
         self.world = core.world
@@ -168,7 +169,10 @@ class EpisodeEnv(FixedLengthEnv):
 
     def reset(self, *, seed: int | None = None,
               options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        """Begin the episode with this seed (`eitbench.data.seeds`), or a random training one."""
+        """Begin the episode with this seed (`eitbench.data.seeds`), or a random one of the split.
+        ``ValueError`` if ``options`` are given: there are none."""
+        if options:
+            raise ValueError(f"options must be None or empty, got {options!r}")
         super().reset(seed=seed)
         if seed is not None:
             self.pool.reset()
@@ -236,11 +240,11 @@ class EpisodeVectorEnv(gym.vector.VectorEnv[Any, np.ndarray, np.ndarray]):
     metadata = {"render_modes": [], "autoreset_mode": AutoresetMode.NEXT_STEP}  # noqa: RUF012
 
     def __init__(self, make_core: Callable[[], EpisodeCore], num_envs: int, episodes: int | None,
-                 max_episode_steps: int | None, *, threads: int = 1,
+                 split: str, max_episode_steps: int | None, *, threads: int = 1,
                  core_episodes: int = MAX_CORE_EPISODES) -> None:
         self.num_envs = _check.integer("num_envs", num_envs, low=1)
-        self.pool = EpisodeSampler(episodes)
-        """training episodes of unseeded resets"""
+        self.pool = EpisodeSampler(episodes, split)
+        """episodes of unseeded resets"""
         self._threads = _check.integer("threads", threads, low=1)
         size = min(core_episodes, -(-num_envs // threads))
         self._parts = [slice(first, first + size) for first in range(0, num_envs, size)]
@@ -285,10 +289,10 @@ class EpisodeVectorEnv(gym.vector.VectorEnv[Any, np.ndarray, np.ndarray]):
 
     def reset(self, *, seed: int | list[int | None] | None = None,
               options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        """Begin the episodes seed, seed + 1, …, or a list of seeds, or random training episodes."""
-        if options and "reset_mask" in options:
-            raise ValueError("options must not hold 'reset_mask': all environments begin and end "
-                             "together")
+        """Begin the episodes seed, seed + 1, …, or a list of seeds, or random ones of the split."""
+        if options:
+            raise ValueError("options must be None or empty, since all environments begin and end "
+                             f"together; got {options!r}")
         seeds = self._seeds(seed)
         if any(one is not None for one in seeds):
             self.pool.reset()

@@ -149,7 +149,8 @@ class EstimationEnv(EpisodeEnv):
     | `assume` | set by the id | dict of wrong assumptions on the flow in the task's model |
     | `variant` | None | name of a robustness variant, as "strong-slugs" of `eitbench/Pipe2D-v0` |
     | `world` | None | numbers to change, as in `{"instrument": {"noise_relative": 0.02}}` |
-    | `episodes` | None | training episodes of unseeded resets; None: 1, 8, … up to 1000 |
+    | `episodes` | None | episodes of unseeded resets; None: 1, 8, … up to 1000, of dev 32 |
+    | `split` | "train" | split of unseeded resets: "train", or "dev" for evaluation |
     | `render_mode` | None | "rgb_array": truth, estimate, standard deviation, active pair |
     """
 
@@ -158,9 +159,9 @@ class EstimationEnv(EpisodeEnv):
     def __init__(self, name: str, *, variant: str | None = None,
                  world: dict[str, Any] | None = None, lag: int | str | None = None,
                  assume: dict[str, Any] | None = None, episodes: int | None = None,
-                 render_mode: str | None = None) -> None:
+                 split: str = "train", render_mode: str | None = None) -> None:
         played, self.lag, assumed = resolve_arguments(entry(name, variant), world, lag, assume)
-        super().__init__(EstimationCore(played, self.lag), episodes, render_mode)
+        super().__init__(EstimationCore(played, self.lag), episodes, split, render_mode)
         self._task_options = {"lag": self.lag, **assumed}
         self.n_nodes = self.core.n_nodes
         """nodes of the mesh of the estimates"""
@@ -220,10 +221,10 @@ class EstimationVectorEnv(EpisodeVectorEnv):
     def __init__(self, name: str, *, num_envs: int = 1, variant: str | None = None,
                  world: dict[str, Any] | None = None, lag: int | str | None = None,
                  assume: dict[str, Any] | None = None, episodes: int | None = None,
-                 max_episode_steps: int | None = None) -> None:
+                 split: str = "train", max_episode_steps: int | None = None) -> None:
         played, lag, _ = resolve_arguments(entry(name, variant), world, lag, assume)
         super().__init__(lambda: EstimationCore(played, lag), num_envs, episodes,
-                         max_episode_steps)
+                         split, max_episode_steps)
 
     def _checked(self, actions: np.ndarray) -> np.ndarray:
         return check_actions(actions, self.action_space, self.cores[0].n_nodes)

@@ -58,7 +58,8 @@ class InjectionEnv(EpisodeEnv):
     | `inflow` | set by the id | inflow prior: "white" noise (Table 5.1), or "learned" |
     | `variant` | None | name of a robustness variant of the id |
     | `world` | None | numbers to change, as in `{"schedule": {"budget": 20}}` |
-    | `episodes` | None | training episodes of unseeded resets; None: 1, 8, … up to 1000 |
+    | `episodes` | None | episodes of unseeded resets; None: 1, 8, … up to 1000, of dev 32 |
+    | `split` | "train" | split of unseeded resets: "train", or "dev" for evaluation |
     | `render_mode` | None | "rgb_array": truth, estimate, standard deviation, injection |
     | `threads` | 1 | vector form only: threads of the filters; give BLAS one thread then |
     """
@@ -68,9 +69,11 @@ class InjectionEnv(EpisodeEnv):
     def __init__(self, name: str, *, variant: str | None = None,
                  world: dict[str, Any] | None = None, estimator: str = "reduced",
                  observation: str = "scaled", gate: float | None = None, inflow: str | None = None,
-                 episodes: int | None = None, render_mode: str | None = None) -> None:
+                 episodes: int | None = None, split: str = "train",
+                 render_mode: str | None = None) -> None:
         self.rules = resolve_rules(entry(name, variant), world, gate, inflow, estimator)
-        super().__init__(InjectionCore(self.rules, estimator, observation), episodes, render_mode)
+        super().__init__(InjectionCore(self.rules, estimator, observation), episodes, split,
+                         render_mode)
 
     def _checked(self, action: Any) -> np.ndarray:
         space = self.action_space
@@ -110,11 +113,11 @@ class InjectionVectorEnv(EpisodeVectorEnv):
     def __init__(self, name: str, *, num_envs: int = 1, variant: str | None = None,
                  world: dict[str, Any] | None = None, estimator: str = "reduced",
                  observation: str = "scaled", gate: float | None = None, inflow: str | None = None,
-                 episodes: int | None = None, threads: int = 1,
+                 episodes: int | None = None, split: str = "train", threads: int = 1,
                  max_episode_steps: int | None = None) -> None:
         self.rules = rules = resolve_rules(entry(name, variant), world, gate, inflow, estimator)
         super().__init__(lambda: InjectionCore(rules, estimator, observation), num_envs, episodes,
-                         max_episode_steps, threads=threads,
+                         split, max_episode_steps, threads=threads,
                          core_episodes=num_envs if estimator == "none" else MAX_CORE_EPISODES)
 
     def action_masks(self) -> np.ndarray:

@@ -86,6 +86,27 @@ def test_unseeded_resets_follow_the_first_seed(name):
     assert set(drawn[0]) == {one.reset(seed=seed)[0]["voltages"].tobytes() for seed in (0, 1)}
 
 
+@pytest.mark.parametrize("id", [PIPE, "eitbench/Pipe2DInjection-v0"])
+def test_resets_without_a_seed_draw_dev_episodes(id):
+    """With split="dev": in scalar and vector environments the same few dev episodes; test episodes are refused."""
+    kwargs = short(id) | {"episodes": 2, "split": "dev"}
+    env, train = gym.make(id, **kwargs), gym.make(id, **short(id))
+    dev = {train.reset(seed=seed)[0].tobytes() if id != PIPE else train.reset(seed=seed)[0]["voltages"].tobytes()
+           for seed in (100_000, 100_001)}
+
+    def voltages(observation):
+        return observation["voltages"] if id == PIPE else observation
+    assert {voltages(env.reset()[0]).tobytes() for _ in range(12)} == dev
+    many = gym.make_vec(id, num_envs=3, vectorization_mode="vector_entry_point", **kwargs)
+    many.reset()
+    assert set(many.unwrapped.seeds) <= {100_000, 100_001}
+    for wrong in ("test", "all", None):
+        with pytest.raises(ValueError, match="split must be train or dev"):
+            gym.make(id, split=wrong)
+    with pytest.raises(ValueError, match="options must be None or empty"):
+        env.reset(options={"split": "dev"})
+
+
 def test_types_and_lengths(name):
     """Python floats and bools, fresh arrays, scalars in info, and T + lag steps."""
     env = make(name)
