@@ -126,7 +126,7 @@ class VelocityStates(StateSpace):
                                                          self.flow.basis_fields)
 
         def advance(X: np.ndarray) -> np.ndarray:
-            """Return [[F, ∂c⁺/∂θ], [0, I]] X, with sparse solves, which are faster than F X."""
+            """Return [[F, ∂c⁺/∂θ], [0, I]] X; a sparse solve is faster than F X."""
             moved = transport.step(X[:n], X[inlet], 0.0)
             moved += by_theta @ X[n:]
             return np.concatenate([moved, X[n:]])
