@@ -32,8 +32,8 @@ def run(
              "all built-in estimators.")] = None,
     policy: Annotated[list[str] | None, typer.Option(
         help="Name of a built-in injection policy, or path of a .py file or of an agent's "
-             "model.zip; may be repeated. Default in injection environments: all built-in "
-             "policies.")] = None,
+             "model.zip; needs --env; may be repeated. Default in injection environments: all "
+             "built-in policies.")] = None,
     seeds: Annotated[str | None, typer.Option(
         help="Episode seeds, e.g. dev:0-9 or test:3. Default: seeds of the suite.")] = None,
     settings: Annotated[list[str] | None, typer.Option(
