@@ -1,4 +1,4 @@
-"""Results on disk: one file per episode, replaced atomically, from which records are built."""
+"""Episode store: results of a run on disk, one file per episode, from which records are built."""
 
 from __future__ import annotations
 
@@ -41,17 +41,20 @@ PACKAGES = ("eitbench", "numpy", "scipy", "gymnasium", "scikit-fem", "numba", "s
             "sb3-contrib", "torch")
 """Packages whose versions are part of a record."""
 _OF_ALL = ("environment", "method", *COMMON_FIELDS)
-"""Fields that all results of one record share."""
+"""Fields of a record that have one value for all its episodes."""
 _LOCAL = ("traceback",)
-"""Fields of a result that are not part of a record."""
+"""Fields of an episode result that are not copied into a record."""
 _OUTPUTS = ("--out", "-o", "--to")
-"""Command-line options for output folders, on which no score depends."""
+"""Command-line options for output folders, which do not affect scores."""
 
 
 class EpisodeStore:
-    """Folder of a run: ``episodes/ENV/METHOD/SEED.json``, with the estimates in ``SEED.npz``.
+    """Results of a run in a folder: ``episodes/ENV/METHOD/SEED.json``, with the estimates in
+    ``SEED.npz``.
 
-    Files are written atomically, so runs may share a folder and may be interrupted at any time.
+    A result is a dictionary: the scores of one method in one episode, with environment, versions
+    and status ("ok" or a failure). Files are written atomically, so several runs may share a folder
+    and may be interrupted at any time.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -59,7 +62,10 @@ class EpisodeStore:
 
     def put(self, environment: str, method: str, seed: int, result: dict[str, Any],
             fields: dict[str, np.ndarray]) -> None:
-        """Store one episode; the estimates first, so that a stored result always has them."""
+        """Store the ``result`` and the estimates ``fields`` of one episode.
+
+        The estimates are written first, so that each stored result has its estimates.
+        """
         path = self._path(environment, method, format_seed(seed))
         if fields:
             content = io.BytesIO()
@@ -68,7 +74,7 @@ class EpisodeStore:
         write_atomically(path, json.dumps(result, indent=1, allow_nan=False).encode())
 
     def has_result(self, environment: str, method: str, seed: int, identity: str) -> bool:
-        """Return whether a successful result with this identity is stored."""
+        """Return whether a successful result with this ``identity`` (its cache key) is stored."""
         try:
             result = self.result(environment, method, seed)
         except ValueError:
@@ -88,7 +94,8 @@ class EpisodeStore:
                 warnings.warn(f"{sanitize(str(path))} is left out: it {error}", stacklevel=2)
 
     def tracebacks(self, record: dict[str, Any]) -> dict[str, str]:
-        """Map the seed of each failed episode to the traceback in the method's file."""
+        """Map the seed of each failed episode of a record to its traceback, restricted to the
+        method's file; empty if it is not stored."""
         environment, method = record["environment"]["name"], record["method"]
         failed = [episode["seed"] for episode in record["episodes"] if episode["status"] != "ok"]
         texts = dict.fromkeys(failed, "")
@@ -98,10 +105,11 @@ class EpisodeStore:
         return texts
 
     def fields(self, result: dict[str, Any]) -> dict[str, np.ndarray]:
-        """Read the estimates of a result: ``mean`` and optionally ``std``, (T, n) in mol/m³.
+        """Read the estimates of a result: ``mean`` and optionally ``std``, (T, n) in mol/m³ for T
+        states and n nodes.
 
-        ``std`` is NaN in states without a variance. ``FileNotFoundError`` if the estimates are
-        missing; ``ValueError``, naming the file, if it is damaged.
+        ``std`` is NaN in states for which the method reported no variance. ``FileNotFoundError`` if
+        the file of estimates is missing; ``ValueError``, naming the file, if it is damaged.
         """
         path = self._path(result["environment"]["name"], result["method"], result["seed"])
         path = path.with_suffix(".npz")
@@ -120,11 +128,11 @@ class EpisodeStore:
         return fields
 
     def records(self, also: Iterable[dict[str, Any]] = ()) -> list[dict[str, Any]]:
-        """Build one unchecked record per environment, method and split of the seeds.
+        """Build one record per environment, method and split of the seeds, without validation.
 
-        Only stored results of the latest method's file and declared versions are used. ``also`` are
-        results of records: with the same version of the method, they replace missing and failed
-        episodes.
+        Only those stored results are used that have the method's file and the `declared_versions`
+        of the most recent one. ``also`` are results of other records: if they have the same version
+        of the method, they replace missing and failed episodes.
         """
         own, others = _by_record(self.results()), _by_record(also)
         records = []
@@ -136,8 +144,8 @@ class EpisodeStore:
         return records
 
     def write_records(self) -> list[dict[str, Any]]:
-        """Write the `records` into ``records/`` and return them; an invalid record is skipped with
-        a warning."""
+        """Write the valid `records` into the folder ``records`` and return them; an invalid record
+        is skipped with a warning."""
         written = []
         for record in self.records():
             try:
@@ -170,7 +178,8 @@ def _latest(results: list[dict[str, Any]]) -> dict[str, Any]:
 
 
 def _of_latest_code(results: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Select the results with the most recently run method's file and declared versions."""
+    """Select the results that have the method's file and the declared versions of the result that
+    finished last."""
     def code(result: dict[str, Any]) -> tuple[Any, ...]:
         versions = result["run"]["versions"]
         return result["method_sha256"], *map(versions.get, declared_versions())
@@ -180,8 +189,8 @@ def _of_latest_code(results: list[dict[str, Any]]) -> list[dict[str, Any]]:
 
 
 def _gathered(results: list[dict[str, Any]]) -> dict[str, Any]:
-    """Build the self-reported record from one version's episodes; if a seed has several results,
-    the first successful one is used."""
+    """Build a self-reported record from results of one version of a method; if a seed has several
+    results, the first successful one is used."""
     latest = _latest(results)
     chosen: dict[str, dict[str, Any]] = {}
     for result in results:
@@ -202,7 +211,7 @@ def _gathered(results: list[dict[str, Any]]) -> dict[str, Any]:
 
 
 def record_results(record: dict[str, Any]) -> list[dict[str, Any]]:
-    """Return the results of a record's episodes in the form of a store's results."""
+    """Convert a record to episode results, as `EpisodeStore.results` yields them."""
     shared = {key: record[key] for key in _OF_ALL if key in record}
     runs = record.get("runs", [])
     return [episode | shared | ({"run": runs[episode["run"]]} if runs else {})
@@ -210,13 +219,13 @@ def record_results(record: dict[str, Any]) -> list[dict[str, Any]]:
 
 
 def folder_results(folder: Path) -> list[dict[str, Any]]:
-    """Return the results of all records of a folder. Errors as in `records.read_records`."""
+    """Return the episode results of all records in a folder; errors as in `read_records`."""
     return [result for record in read_records(folder) for result in record_results(record)]
 
 
 def _read(path: Path) -> dict[str, Any]:
-    """Read a result. ``ValueError``, without the file's name, if a record of this result is
-    invalid."""
+    """Read a result. ``ValueError``, whose message does not name the file, if the result is damaged
+    or does not yield a valid record."""
     result = read_json(path)
     try:
         check_record(_gathered([result]))
@@ -229,14 +238,15 @@ def _read(path: Path) -> dict[str, Any]:
 
 
 def declared_versions() -> dict[str, str]:
-    """Return the version numbers that are raised when scores of the same episode change."""
+    """Return the version numbers of simulation and scoring, which developers increase when a change
+    of the code changes scores of the same episode."""
     return {"simulation": str(cache.SIMULATION), "scoring": str(SCORING)}
 
 
 @lru_cache(maxsize=1)
 def provenance() -> dict[str, Any]:
-    """Return versions and commit of the code of this process."""
-    # without `leaderboards`, which holds results
+    """Return package versions, BLAS library and git commit of this process."""
+    # changes in `leaderboards` do not count: it holds results
     status = _git("--no-optional-locks", "status", "--porcelain", "--", ".", ":!leaderboards")
     config: Any = np.show_config(mode="dicts")  # type: ignore[call-overload]
     blas = config["Build Dependencies"]["blas"]
@@ -249,8 +259,8 @@ def provenance() -> dict[str, Any]:
 
 
 def portable_command(command: str) -> str:
-    """Return a command without machine-specific paths: output folders are removed, and other paths
-    that are absolute or contain ``..`` are reduced to their names."""
+    """Return a command without machine-specific paths: options for output folders are removed, and
+    other paths that are absolute or contain ``..`` are reduced to their last component."""
     try:
         words = iter(shlex.split(command))
     except ValueError:                                # an unbalanced quote
@@ -272,16 +282,16 @@ def _portable(word: str) -> str:
 
 @lru_cache(maxsize=1)
 def machine() -> dict[str, Any]:
-    """Describe the machine of this process; in a cluster it may differ from the machine that
-    started the run."""
+    """Return processor, number of cores, operating system and speed of the machine of this process;
+    in a cluster it may differ from the machine that started the run."""
     return {"processor": _processor(), "cores": os.cpu_count(), "system": platform.system(),
             "blas_threads": 1, "matmul_seconds": matmul_seconds()}
 
 
 @lru_cache(maxsize=1)
 def matmul_seconds() -> float:
-    """Time a 1000 × 1000 × 1000 matrix product in double precision on one thread, in s (median of
-    three); times relative to it can be compared between machines."""
+    """Return the time in s of a product of two 1000 × 1000 matrices in double precision on one
+    thread (median of three). Computing times relative to it can be compared between machines."""
     a, b = np.random.default_rng(0).normal(size=(2, 1000, 1000))
     with threadpool_limits(1):
         return float(np.median(timeit.repeat(lambda: a @ b, number=1, repeat=3)))

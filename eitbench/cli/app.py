@@ -54,15 +54,15 @@ def list_() -> None:
             about = (f"lag {lag_steps(each.world, each.settings.get('lag', 0))}, "
                      f"{schedule.scored_steps} scored of {each.world.n_steps} states")
             if schedule.budget is not None:
-                about += f", {schedule.budget} injections allowed"
+                about += f", at most {schedule.budget} injections"
             if each.nominal:
-                about += f", variant {each.variant} of {each.nominal}"
-            about += ", starting point" * each.is_starting_point
+                about += f", shifted variant {each.variant} of {each.nominal}"
+            about += ", recommended to new users" * each.is_starting_point
             lines.append((f"  {name}", subtracks_of(name, {})[0], about))
     lines.append(("environments: measured data", "", ""))
-    lines += [(f"  {name}", "measured", "data are downloaded separately")
+    lines += [(f"  {name}", "measured", "measurements are downloaded separately")
               for name in measured_ids()]
-    for track, heading in (("estimation", "baselines"), ("injection", "policies")):
+    for track, heading in (("estimation", "estimators"), ("injection", "policies")):
         lines.append((heading, "", ""))
         methods = {name: load_method(name, track) for name in builtin_methods(track)}
         lines += [(f"  {name}", ", ".join(method.subtracks), method.title)
@@ -156,7 +156,7 @@ def leaderboard(
              "leaderboard.csv, leaderboard.md, episodes.csv.gz and the pages site/ next to it "
              "instead.")] = None,
 ) -> None:
-    """Print the table and rewrite the page from the results stored in a folder.
+    """Print the table and rewrite the HTML report from the results stored in a folder.
 
     With --records, invalid records are skipped and reported, with exit status 1. Without a valid
     record, no file is written.

@@ -45,7 +45,7 @@ def estimate(
         min=1, help="Number of initial homogeneous frames, used without a reference.")] = 1,
 ) -> None:
     """Estimate the concentration in a real tank or pipe: calibrate the vessel, run methods, and
-    write a page with estimates, residuals of withheld measurements and data-quality warnings."""
+    write a report with estimates, residuals of withheld measurements and data-quality warnings."""
     from eitbench.bench.measured import plotted_steps
     from eitbench.bench.runner import run_on_measurements
     from eitbench.envs.measured import MeasuredEnv

@@ -1,4 +1,4 @@
-"""Command `run`: run methods, print the table and write the page."""
+"""Command `run`: run methods, print the table and write the HTML report."""
 
 from __future__ import annotations
 
@@ -23,37 +23,40 @@ Suite = StrEnum("Suite", ["quick", "full"])
 
 def run(
     suite: Annotated[Suite, typer.Option(
-        help="quick: the 2D pipe, test:0-3, four minutes on two cores; full: every estimation "
-             "environment, more seeds, also slow methods.")] = Suite.quick,
+        help="Preset of environments and seeds if --env or --seeds is missing. quick: the 2D "
+             "pipe, test:0-3, four minutes on two cores; full: every estimation environment, "
+             "more seeds, also slow methods.")] = Suite.quick,
     env: options.Environments = None,
     baseline: Annotated[list[str] | None, typer.Option(
-        help="Built-in estimator name, or path of a .py file; may be repeated. Default: all "
-             "built-in ones.")] = None,
+        help="Name of a built-in estimator, or path of a .py file; may be repeated. Default: "
+             "all built-in estimators.")] = None,
     policy: Annotated[list[str] | None, typer.Option(
-        help="Built-in injection policy name, or path of a .py file or of an agent's model.zip; "
-             "may be repeated. Default in injection environments: all built-in ones.")] = None,
+        help="Name of a built-in injection policy, or path of a .py file or of an agent's "
+             "model.zip; needs --env; may be repeated. Default in injection environments: all "
+             "built-in policies.")] = None,
     seeds: Annotated[str | None, typer.Option(
-        help="Episode seeds, e.g. dev:0-9 or test:3. Default: the suite's.")] = None,
+        help="Episode seeds, e.g. dev:0-9 or test:3. Default: seeds of the suite.")] = None,
     settings: Annotated[list[str] | None, typer.Option(
         "--set", help="Change a number of the world, e.g. instrument.noise_relative=0.02; may be "
                       "repeated. Several values, e.g. 0.01,0.02,0.05, are run one after the "
-                      "other, with a table and a chart on the page.")] = None,
+                      "other, with a table and a chart in the HTML report.")] = None,
     estimator: Annotated[str, typer.Option(
-        help="Filter inside injection environments. full: exact, for scores; reduced: for "
-             "training.")] = "full",
+        help="Kalman filter inside injection environments. full: all nodes, for scores; reduced: "
+             "about a hundred modes, as in training.")] = "full",
     isolate: options.Isolate = options.Isolation.auto,
     jobs: options.Jobs = options.CORES,
     backend: options.Backends = options.Backend.loky,
     out: options.Out = Path("results"),
     records: Annotated[Path | None, typer.Option(
         callback=options.resolve_path,
-        help="For policies: folder of records whose episodes are not rerun, such as "
-             "leaderboards/results.")] = None,
+        help="For policies: folder of records, such as leaderboards/results. Episodes in them are "
+             "not rerun; their scores are included in the table.")] = None,
 ) -> None:
-    """Run estimators or injection policies, print the table and write the page.
+    """Run estimators or injection policies, print the table and write the HTML report.
 
-    Each episode is stored when it finishes; the same command resumes. The table shows this run,
-    the page all results in OUT. The normalised adaptivity gap is printed below tables of policies.
+    Each episode is stored when it finishes; the same command resumes an interrupted run. The table
+    shows this run, the report OUT/index.html all results in OUT. The normalised adaptivity gap is
+    printed below tables of policies.
 
     Exit status 1 if all episodes of a method failed.
     """
@@ -96,8 +99,8 @@ def _track_of(env: list[str], baseline: list[str] | None, policy: list[str] | No
 def print_report(out: Path, asked: Sequence[Job] = (), worlds: Sequence[dict[str, Any]] = ({},),
            before: Sequence[dict[str, Any]] = ()) -> None:
     """Print the table of the given jobs (default: of all results in the folder) and write
-    Markdown and page of all results; for several ``worlds`` that differ in a number, print the
-    errors as a function of it. ``before`` are results of records, which the table includes."""
+    Markdown and HTML report of all results; for several ``worlds`` that differ in a number, print
+    the errors as a function of it. ``before`` are results of records, which the table includes."""
     from eitbench._files import write_atomically
     from eitbench.bench.store import EpisodeStore
     from eitbench.report.boards import anchors, bundled_anchors, run_leaderboards

@@ -1,4 +1,5 @@
-"""Unknown velocity: random-walk parameters, estimated with the concentration (thesis ch. 6)."""
+"""Joint estimation of concentration and velocity, whose parameters are a random walk (thesis ch. 6;
+``docs/methods.md``, 9)."""
 
 from __future__ import annotations
 
@@ -21,27 +22,29 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class VelocityPrior:
-    """Prior of the velocity v = Σ θ_k v_k, with θ a random walk from N(θ_0, diag(std²)).
+    """Prior of the velocity field v = Σ_k θ_k v_k, with fixed fields v_k and parameters θ.
 
-    ``ValueError`` naming an argument of the wrong shape, or if v is not positive for θ_0.
+    θ is a random walk with the initial distribution N(θ_0, diag(std²)). In the pipes θ is in m/s
+    and v_k is dimensionless. ``ValueError`` names an argument of the wrong shape, or ``profiles``
+    if v is not positive for θ_0.
     """
 
     transport_at: Callable[[np.ndarray], ConvectionDiffusion]
-    """θ (k,) -> transport model with that velocity; all with the same mesh and inlet"""
+    """θ (k,) -> transport model with the velocity v(θ); all have the same mesh and inlet"""
     basis_fields: Sequence[VelocityField]
     """the k fields v_k"""
     initial: np.ndarray
     """(k,) θ_0"""
     initial_std: np.ndarray
-    """(k,)"""
+    """(k,) standard deviation of θ at t = 0"""
     walk_std: np.ndarray
-    """(k,) standard deviation of the walk per time step; zero for a constant velocity"""
+    """(k,) standard deviation of the change of θ per time step; 0 for a constant velocity"""
     profiles: np.ndarray
     """(p, k) axial velocity of each v_k at p points across the flow, not on the walls"""
 
     bounds: tuple[float, float] = (0.05, 4.0)
-    """least and largest axial velocity at each point, relative to the velocity for θ_0 there;
-    0 < least < 1 < largest"""
+    """smallest and largest axial velocity at each of the p points, relative to the velocity for θ_0
+    at that point; 0 < smallest < 1 < largest"""
 
     def __post_init__(self) -> None:
         k = len(self.basis_fields)
@@ -58,8 +61,8 @@ class VelocityPrior:
                              f"{self.bounds!r}")
 
     def within_bounds(self, parameters: np.ndarray) -> np.ndarray:
-        """Return the parameters θ (k,), or the nearest point within the bounds on the line towards
-        θ_0."""
+        """Return θ (k,) if it is within the bounds, otherwise the point within the bounds that is
+        nearest to it on the line from θ to θ_0."""
         nominal = self.profiles @ self.initial
         change = self.profiles @ (parameters - self.initial) / nominal
         allowed = np.where(change < 0, *self.bounds) - 1.0
@@ -70,16 +73,18 @@ class VelocityPrior:
 
 
 class VelocityStates(StateSpace):
-    """Concentration and velocity parameters, c⁺ = F(θ) c + Y(θ) c_in + w, θ⁺ = θ + ω.
+    """State space of concentration and velocity parameters, with the evolution model
+    c⁺ = F(θ) c + Y(θ) c_in + w, θ⁺ = θ + ω, where ⁺ denotes the next time step.
 
-    Each step is linearised at the present mean: the covariance of (c, θ) is propagated with
-    [[F, ∂c⁺/∂θ], [0, I]], with F, Y and the derivative of the discrete step at θ̂. The noise is
-    Γ_w = Y(θ̂) Γ_η Y(θ̂)ᵀ + H Γ_e Hᵀ. The nodal part H Γ_e Hᵀ is small and computed only at the
-    nominal velocity, since H costs as much as F.
+    Each step is linearised at the present mean (ĉ, θ̂): the covariance of (c, θ) is propagated with
+    [[F, ∂c⁺/∂θ], [0, I]], where ∂c⁺/∂θ is the derivative of the discretised step. The covariance of
+    w is Γ_w = Y(θ̂) Γ_η Y(θ̂)ᵀ + H Γ_e Hᵀ, with the noise η of the inflow and the nodal noise e
+    (``docs/methods.md``, 1). H Γ_e Hᵀ is small and computed only at the nominal velocity, since H
+    takes as long to compute as F.
 
-    After each measurement vector θ is projected onto the flow's bounds; concentration and
-    covariance do not change. ``ValueError`` naming the argument if it is out of range, of the wrong
-    shape, or not finite.
+    After each measurement vector θ is moved into `VelocityPrior.bounds` by
+    `VelocityPrior.within_bounds`; concentration and covariance do not change. ``ValueError`` names
+    an argument that is out of range, of the wrong shape, or not finite.
 
     Parameters
     ----------
@@ -88,7 +93,8 @@ class VelocityStates(StateSpace):
     mean, covariance : (n,), (n, n)
         Mean and covariance of the concentration at t = 0, in mol/m³ and (mol/m³)².
     inflow, inflow_std : float
-        c_in and the standard deviation of η in mol/m³; ĉ_bh and ĉ_bh/4 in the thesis.
+        c_in and the standard deviation of η, both in mol/m³; ĉ_bh, the best homogeneous estimate,
+        and ĉ_bh/4 in the thesis.
     nodal_noise : (n, n)
         H Γ_e Hᵀ at the nominal velocity, (mol/m³)².
     """
@@ -120,7 +126,7 @@ class VelocityStates(StateSpace):
                                                          self.flow.basis_fields)
 
         def advance(X: np.ndarray) -> np.ndarray:
-            """Return [[F, ∂c⁺/∂θ], [0, I]] X; a step with sparse matrices is cheaper than F X."""
+            """Return [[F, ∂c⁺/∂θ], [0, I]] X; a sparse solve is faster than F X."""
             moved = transport.step(X[:n], X[inlet], 0.0)
             moved += by_theta @ X[n:]
             return np.concatenate([moved, X[n:]])
@@ -146,8 +152,12 @@ class VelocityStates(StateSpace):
 
 
 def velocity_states(task: Task, c_ref: float, bounds: tuple[float, float]) -> VelocityStates:
-    """Return the state space of concentration and velocity, with the parameters of Table 5.1 and
-    the task's prior of the velocity."""
+    """Return the state space of concentration and velocity, with the task's prior of the velocity.
+
+    The initial mean of the concentration and the inflow are ``c_ref`` in mol/m³. Standard
+    deviations are products of ``c_ref`` and the values in Table 5.1; ``bounds`` as in
+    `VelocityPrior`.
+    """
     prior = task.prior
     nodal = task.evolution.state_noise_covariance(0.0, (prior.nodal_std * c_ref)**2)
     return VelocityStates(task_velocity_prior(task, bounds), np.full(task.mesh.n_nodes, c_ref),
@@ -156,7 +166,8 @@ def velocity_states(task: Task, c_ref: float, bounds: tuple[float, float]) -> Ve
 
 
 def task_velocity_prior(task: Task, bounds: tuple[float, float] = (0.05, 4.0)) -> VelocityPrior:
-    """Return a task's prior of the velocity; ``ValueError`` if the velocity is not estimated."""
+    """Return a task's prior of the velocity, with the ``bounds`` of `VelocityPrior`; ``ValueError``
+    if the task specifies the velocity."""
     flow = task.velocity
     if flow is None:
         raise ValueError("task must have an unknown velocity, got one with a specified velocity")
@@ -165,8 +176,11 @@ def task_velocity_prior(task: Task, bounds: tuple[float, float] = (0.05, 4.0)) -
 
 
 def scaled_velocity_prior(task: Task, std: float, walk_std: float) -> VelocityPrior:
-    """Return a prior for an uncertain nominal flow: the task's velocity times a factor, a random
-    walk from 1 ± ``std``. ``ValueError`` if the task has no flow."""
+    """Return a prior for an uncertain nominal flow: the task's velocity times a scalar factor.
+
+    The factor is a random walk with initial mean 1, initial standard deviation ``std``, and
+    standard deviation ``walk_std`` per time step. ``ValueError`` if the task has no flow.
+    """
     from eitbench.physics.transport import ConvectionDiffusion
     transport = task.transport
     if not isinstance(transport, ConvectionDiffusion):

@@ -1,4 +1,8 @@
-"""Calibration on homogeneous fluid: conductivity, contact impedances, gain and noise."""
+"""Calibration of vessel and instrument with measurements of homogeneous fluid: conductivity,
+contact impedances, gain and noise.
+
+Shapes: F frames, K injections, M measurements per injection, L electrodes.
+"""
 
 from __future__ import annotations
 
@@ -12,15 +16,18 @@ from eitbench.physics.cem import CompleteElectrodeModel
 from eitbench.physics.observation import VoltageNoise
 
 CORRECTIONS = ("offset", "gain", "none")
+"""Corrections of the misfit on homogeneous fluid; see `Calibration`."""
 CONTACT_PRIOR_MEAN = 0.1
-"""Prior mean of z σ relative to the electrode's length."""
+"""Prior value of z σ (contact impedance times conductivity, in m) divided by the size of the
+electrode (`electrode_sizes`); dimensionless."""
 CONTACT_PRIOR_LOG_STD = 2.0
-"""Prior standard deviation of the mean of ln z σ."""
+"""Prior standard deviation of the mean of ln(z_l σ) over the electrodes l."""
 CONTACT_BETWEEN_LOG_STD = 0.5
-"""Prior standard deviation of ln z_l relative to the mean of all electrodes."""
+"""Prior standard deviation of the difference between ln z_l and its mean over the electrodes."""
 FIT_NOISE = VoltageNoise(relative=0.01, relative_to_max=0.001)
-"""Noise that weights the measurements in the first fit."""
+"""Noise model for the weights of the first fit; the second uses the misfit of the first."""
 MIN_NOISE_FRAMES = 8
+"""Smallest number of frames for `noise_from_frames`."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,35 +37,37 @@ class Calibration:
     conductivity: float
     """σ in S/m"""
     conductivity_std: float
-    """standard deviation of ln σ"""
+    """standard deviation of ln σ, dimensionless"""
     contact_impedance: np.ndarray
     """(L,) z in Ω·m²"""
     contact_impedance_std: np.ndarray
     """(L,) standard deviation of ln z"""
     gain: float
-    """instrument gain, measured per true voltage; 1 unless the conductivity is specified"""
+    """gain of the instrument, measured voltage / true voltage; 1 unless σ was specified"""
     noise: VoltageNoise
-    """noise of one measurement"""
+    """noise model of a single measurement, not of the mean over frames"""
     noise_from_repeats: bool
-    """whether the noise is the scatter of repeats or frames; else it includes the model error"""
+    """True if the noise is given, or fitted to the variance between frames; False if it is fitted
+    to the misfit of a single frame, which includes the model error"""
     mean_voltages: np.ndarray
-    """(K, M) V, mean of the frames; NaN where nothing was measured"""
+    """(K, M) V, mean over the frames; NaN where no frame has a value"""
     model_voltages: np.ndarray
     """(K, M) V of the fitted model"""
     correction: str = "offset"
-    """one of `CORRECTIONS`, for the misfit of the fitted model"""
+    """one of `CORRECTIONS`: "offset" subtracts the misfit on homogeneous fluid from measurements,
+    "gain" divides by the ratio `channel_gain`, "none" corrects nothing"""
 
     @property
     def offset(self) -> np.ndarray:
-        """(K, M) V subtracted from measurements, 0 where nothing was measured: the mean
-        approximation error of the model (Kaipio & Somersalo 2005)."""
+        """(K, M) V to subtract from measurements if the correction is "offset", else 0: the mean
+        approximation error of the model (Kaipio & Somersalo 2005); 0 where no frame has a value."""
         if self.correction != "offset":
             return np.zeros_like(self.mean_voltages)
         return np.nan_to_num(self.mean_voltages - self.model_voltages)
 
     @property
     def channel_gain(self) -> np.ndarray:
-        """(K, M) ratio of each measurement to the model for the correction "gain", else 1."""
+        """(K, M) measured / model voltage if the correction is "gain", else 1."""
         if self.correction != "gain":
             return np.ones_like(self.mean_voltages)
         return np.nan_to_num(self.mean_voltages / self.model_voltages, nan=1.0)
@@ -67,12 +76,14 @@ class Calibration:
 def calibrate(electrodes: CompleteElectrodeModel, currents: np.ndarray, matrix: np.ndarray,
               voltages: np.ndarray, *, depth: float = 1.0, conductivity: float | None = None,
               correction: str = "offset", noise: VoltageNoise | None = None) -> Calibration:
-    """Fit σ and z_l to homogeneous fluid by Gauss–Newton in their logarithms.
+    """Fit conductivity σ and contact impedances z_l to voltages of homogeneous fluid, by
+    Gauss–Newton in their logarithms.
 
-    A prior draws contact impedances to their common mean, and outliers have less weight. Voltages
-    scale as gain/σ at a given σz, so the gain is fitted only if the ``conductivity`` is specified.
-    ``ValueError`` names an argument of the wrong shape, and voltages without numbers or with the
-    wrong sign.
+    The prior of the z_l has a common mean and penalises deviations from it; a robust loss (soft L1)
+    reduces the weight of outliers. At given products z_l σ the voltages are proportional to gain/σ,
+    so only this ratio can be fitted: σ with gain 1, or the gain if ``conductivity`` is specified.
+    ``ValueError`` names an argument of the wrong shape, and voltages that are all NaN, all 0, or of
+    the wrong sign.
 
     Parameters
     ----------
@@ -81,13 +92,13 @@ def calibrate(electrodes: CompleteElectrodeModel, currents: np.ndarray, matrix: 
     currents, matrix, depth
         As in `MeasurementModel`.
     voltages : (F, K, M)
-        V, F frames; NaN where nothing was measured.
+        Measurements in V; NaN where a value is missing.
     conductivity : float, optional
-        σ in S/m if it is known.
+        σ in S/m, if it was measured otherwise.
     correction : "offset", "gain" or "none"
         Treatment of the misfit of the fitted model; see `Calibration`.
     noise : VoltageNoise, optional
-        Default: fitted to the scatter of the frames, or of a single frame to the misfit.
+        Default: fitted to the variance between frames, or to the misfit of a single frame.
     """
     if correction not in CORRECTIONS:
         raise ValueError(f"correction must be one of {', '.join(CORRECTIONS)}, got {correction!r}")
@@ -111,7 +122,8 @@ def calibrate(electrodes: CompleteElectrodeModel, currents: np.ndarray, matrix: 
     def model(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return voltages (K, M) in V and their derivatives by x, (2 + L, K, M).
 
-        σ = 1/ρ and contacts ζ = z σ, with x = (ln ρ, mean of ln ζ, deviations from that mean).
+        x = (ln ρ, mean of ln ζ_l, deviations of the ln ζ_l from this mean), with the resistivity
+        ρ = 1/σ and contacts ζ_l = z_l σ.
         """
         contacts = np.exp(x[1] + x[2:])
         vessel = electrodes.with_contacts(contacts)
@@ -165,8 +177,8 @@ def calibrate(electrodes: CompleteElectrodeModel, currents: np.ndarray, matrix: 
 
 
 def electrode_misfits(calibration: Calibration, matrix: np.ndarray) -> np.ndarray:
-    """Return (L,) V, the RMS misfit of the homogeneous model in the measurements of each electrode;
-    ``matrix`` (M, L) maps potentials to measured voltages."""
+    """Return (L,) V, for each electrode the RMS misfit of the homogeneous model over the
+    measurements that involve it; ``matrix`` (M, L) maps potentials to measured voltages."""
     involved = (matrix != 0).astype(float)
     squares = np.nan_to_num(calibration.mean_voltages - calibration.model_voltages)**2
     count = np.maximum((np.isfinite(calibration.mean_voltages) @ involved).sum(axis=0), 1.0)
@@ -186,22 +198,24 @@ def electrode_sizes(electrodes: CompleteElectrodeModel) -> np.ndarray:
 
 
 def noise_from_frames(frames: np.ndarray) -> VoltageNoise | None:
-    """Fit a noise model to the third differences of frames (F, K, M) in V, in which slow changes
-    cancel; None for fewer than `MIN_NOISE_FRAMES`."""
+    """Fit a noise model to the third differences in time of frames (F, K, M) in V, in which slow
+    changes cancel. Return None for fewer than `MIN_NOISE_FRAMES` frames, or without values."""
     if len(frames) < MIN_NOISE_FRAMES:
         return None
     squares = np.diff(frames, n=3, axis=0)**2
     used = np.isfinite(squares).any(axis=0)
     if not used.any():
         return None
-    # robust to fast targets: the median of squares, 0.455 of their mean for a normal distribution
+    # the median is robust to fast targets; for a normal distribution it is 0.455 of the mean, and
+    # third differences have 20 times the variance of a measurement
     variance = np.nanmedian(squares[:, used], axis=0) / 20 / 0.455
     return _fit_noise(variance, np.nanmean(np.abs(frames[:, used]), axis=0))
 
 
 def _fit_noise(variance: np.ndarray, size: np.ndarray) -> VoltageNoise:
-    """Fit std² = (relative·V)² + floor² to the variances of voltages of these sizes by least
-    squares of relative deviations, which weight large and small voltages equally."""
+    """Fit std² = (relative·size)² + floor² to the ``variance`` in V² of voltages with the absolute
+    values ``size`` in V, by least squares of relative deviations, which weight large and small
+    voltages equally."""
     typical = variance.mean() * (0.1 + size**2 / np.mean(size**2))
     terms = np.stack([size**2, np.ones_like(size)], axis=1) / typical[:, None]
     (relative, floor), _ = nnls(terms, variance / typical)

@@ -127,7 +127,7 @@ def test_list():
     assert lines.keys() >= {*ids(), *builtin_methods("estimation"), *builtin_methods("injection")}
     assert "injection" in lines["random_pair"] and "Random pair" in lines["random_pair"]
     assert "smoothing" in lines["eitbench/Pipe2DSmoothing-v0"] and "3 scored of 5" in lines[PIPE]
-    assert lines["eitbench/Pipe3D-v0"].endswith("starting point")
+    assert lines["eitbench/Pipe3D-v0"].endswith("recommended to new users")
     assert lines["eitbench/Pipe2DStrongSlugs-v0"].endswith("variant strong-slugs of eitbench/Pipe2D-v0")
     assert "environments: robustness variants" in said
     assert "filter, smoothing" in lines["gauss_newton"] and "Stationary Gauss–Newton" in lines["gauss_newton"]
