@@ -9,14 +9,14 @@ import pytest
 
 ROOT = Path(__file__).parent.parent
 PACKAGE = ROOT / "eitbench"
-BUDGETS = {"numerics": 1580, "scoring": 110, "physics": 1420, "worlds": 2700, "data": 1525, "estimation": 5810,
-           "measured": 1910, "envs": 1660, "bench": 5190, "report": 3150, "rl": 815, "cli": 1000}
+BUDGETS = {"numerics": 1590, "scoring": 110, "physics": 1420, "worlds": 2700, "data": 1530, "estimation": 5810,
+           "measured": 1910, "envs": 1675, "bench": 5190, "report": 3150, "rl": 815, "cli": 1000}
 """Package (or module) -> lines of Python allowed, blank lines and docstrings included. Each imports only from those
 before it."""
 TOP = 430
 """Lines allowed in the other modules at the top: public names, argument checks, files, messages."""
 BASELINES = 2045
-TESTS = 20_470
+TESTS = 20_500
 MODULES = {".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__"): path
            for path in PACKAGE.rglob("*.py")}
 

@@ -27,7 +27,7 @@ BATCH_SIZE = 8
 MAX_EPISODES = 1000
 """Largest number of training episodes of a growing sampler."""
 DEV_EPISODES = 32
-"""Episodes of the split dev from which unseeded resets draw, as many as training evaluates."""
+"""Number of dev episodes from which unseeded resets draw; the default of training evaluations."""
 SINGLE_EPISODE_RESETS = 4
 """First resets, which all begin ``train:0``."""
 RESETS_PER_EPISODE = 8
@@ -86,7 +86,7 @@ def _simulate_and_store(world: World, seeds: Sequence[int], folder: Path,
 
 
 class EpisodeSampler:
-    """Sampler of the episodes of unseeded resets, training episodes or those of the ``split`` dev.
+    """Sampler of the episodes of unseeded resets, from the ``split`` train or dev.
 
     It draws from the first ``episodes`` episodes, for dev by default from `DEV_EPISODES`. For
     training the number grows by default with the resets since the

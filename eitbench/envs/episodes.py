@@ -170,7 +170,7 @@ class EpisodeEnv(FixedLengthEnv):
     def reset(self, *, seed: int | None = None,
               options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Begin the episode with this seed (`eitbench.data.seeds`), or a random one of the split.
-        ``ValueError`` if ``options`` are given: there are none."""
+        ``ValueError`` if ``options`` are given."""
         if options:
             raise ValueError(f"options must be None or empty, got {options!r}")
         super().reset(seed=seed)

@@ -277,7 +277,7 @@ agents use the same filter, so that they differ only in their injections.
 register_injection(PIPE_2D, "eitbench/Pipe2DInjection-v0", description=f"""{INJECTION_TEXT}
 This environment is a reference case, not a competition: no policy is better than one pair near the
 inlet, injected all the time (the flow carries the information from the inlet through the whole
-pipe), and the best injection does not depend on the data. The adaptivity gap is zero
+pipe), and the best injection does not depend on the data. The normalised adaptivity gap is zero
 (`docs/injection.md`).
 """)
 register_injection(PIPE_2D, "eitbench/Pipe2DInjectionInflow-v0", inflow="learned",
@@ -285,14 +285,14 @@ register_injection(PIPE_2D, "eitbench/Pipe2DInjectionInflow-v0", inflow="learned
 The filter uses a prior of duration and width of slugs that is fitted to training inflows
 (`docs/methods.md`, 10), and linearises about each prediction; in `eitbench/Pipe2DInjection-v0` its
 inflow is white noise, Table 5.1. With the best pair at the inlet the error is one seventh of the
-error there. This environment is a reference case too: the adaptivity gap is zero
+error there. This environment is a reference case too: the normalised adaptivity gap is zero
 (`docs/injection.md`).
 """)
 register_injection(PIPE_2D_CURRENTS, "eitbench/Pipe2DInjectionCurrents-v0",
                    description=f"""{INJECTION_TEXT}
 The action is a current for each electrode. This environment is a reference case: the best currents,
 the same at every step, reduce ẽ_c by a tenth relative to pairs, and the clairvoyant policy by
-another 2 %. The adaptivity gap is zero.
+another 2 %. The normalised adaptivity gap is zero.
 
 Actions are relative to the instrument's 0.1 A/m. Entries are clipped to ±1; their mean is
 subtracted (Σ I = 0); if the result exceeds the norm of a pair, it is scaled down to it. The norm is
@@ -318,8 +318,8 @@ measurements that differ by more than 8 standard deviations (`gate`) from its pr
 whole injection if it rejects more than a third of its measurements.
 
 The best pair depends on the episode, and the measurements indicate it (`doubt` and `innovations`
-show the broken electrodes): the adaptivity gap is 0.52, with a 95 % interval from 0.28 to 0.82 over
-the 50 episodes of the leaderboard (`docs/injection.md`).
+show the broken electrodes): the normalised adaptivity gap is 0.52, with a 95 % interval from 0.28 to
+0.82 over the 50 episodes of the leaderboard (`docs/injection.md`).
 """)
 
 # -- 2D pipe with rare slugs --
@@ -346,7 +346,7 @@ register_injection(PIPE_2D_BUDGET, "eitbench/Pipe2DInjectionInflowBudget-v0",
                    test_seeds="test:0-49", inflow="learned", description="""
 The rare slugs and the budget of `eitbench/Pipe2DInjectionBudget-v0`, with the filter of
 `eitbench/Pipe2DInjectionInflow-v0`, whose inflow prior is fitted to training inflows. On the
-episodes dev:0-7 the adaptivity gap is 0.45, with a 95 % interval from 0.34 to 0.62
+episodes dev:0-7 the normalised adaptivity gap is 0.45, with a 95 % interval from 0.34 to 0.62
 (`docs/injection.md`).
 """)
 register_injection(PIPE_2D_BUDGET, "eitbench/Pipe2DInjectionBudget-v0", test_seeds="test:0-49",
@@ -358,8 +358,8 @@ inject (`action_masks`); injections within the budget cost nothing. In a step wi
 `voltages` are the amplifiers' noise (zero here) and `innovations` are zero. The first frame does
 not count against the budget.
 
-The adaptivity gap is 0.51, with a 95 % interval from 0.45 to 0.57 over the 50 episodes of the
-leaderboard (`docs/injection.md`).
+The normalised adaptivity gap is 0.51, with a 95 % interval from 0.45 to 0.57 over the 50 episodes
+of the leaderboard (`docs/injection.md`).
 """)
 
 # -- 2D pipe with a mean velocity that drifts --
@@ -377,8 +377,8 @@ velocity together (the joint extended Kalman filter of the thesis' chapter 6), f
 agent may observe slugs at the inlet, on their way or in the region; the position of a slug that has
 entered is as uncertain as the velocity that carries it.
 
-This environment is a competition: the adaptivity gap is 1.04, with a 95 % interval from 0.70 to
-1.96 over the 30 episodes of the leaderboard. No hand-written adaptive policy outperforms random
+This environment is a competition: the normalised adaptivity gap is 1.04, with a 95 % interval
+from 0.70 to 1.96 over the 30 episodes of the leaderboard. No hand-written adaptive policy outperforms random
 pairs, which are as good as the best cycle; trained agents do (`docs/injection.md`).
 """)
 
@@ -391,6 +391,6 @@ the flow of the liquid and no model of the ball. The first frame is one injectio
 
 This environment is a reference case, not a competition: the liquid carries the ball past every
 pair, the clairvoyant policy improves ẽ_c by 8 % over random pairs, and no adaptive policy
-outperforms the best pair. The adaptivity gap is 0.25, with a 95 % interval from 0.05 to 0.40 over
-the 10 episodes of the leaderboard, a quotient of small numbers (`docs/injection.md`).
+outperforms the best pair. The normalised adaptivity gap is 0.25, with a 95 % interval from 0.05 to
+0.40 over the 10 episodes of the leaderboard, a quotient of small numbers (`docs/injection.md`).
 """)

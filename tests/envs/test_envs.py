@@ -88,7 +88,7 @@ def test_unseeded_resets_follow_the_first_seed(name):
 
 @pytest.mark.parametrize("id", [PIPE, "eitbench/Pipe2DInjection-v0"])
 def test_resets_without_a_seed_draw_dev_episodes(id):
-    """With split="dev": in scalar and vector environments the same few dev episodes; test episodes are refused."""
+    """split="dev" draws the same dev episodes in scalar and vector environments; other splits are refused."""
     kwargs = short(id) | {"episodes": 2, "split": "dev"}
     env, train = gym.make(id, **kwargs), gym.make(id, **short(id))
     dev = {train.reset(seed=seed)[0].tobytes() if id != PIPE else train.reset(seed=seed)[0]["voltages"].tobytes()

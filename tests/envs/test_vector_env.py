@@ -184,7 +184,7 @@ def test_wrong_number_of_seeds_is_named(seed):
 
 
 def test_reset_of_some_is_refused():
-    """All environments begin and end together, and there are no options."""
+    """All environments begin and end together, and `reset` has no options."""
     envs = make()
     actions = actions_for(envs, 2)
     played = play(envs, actions, seed=1, options={})
