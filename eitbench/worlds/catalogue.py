@@ -318,8 +318,8 @@ measurements that differ by more than 8 standard deviations (`gate`) from its pr
 whole injection if it rejects more than a third of its measurements.
 
 The best pair depends on the episode, and the measurements indicate it (`doubt` and `innovations`
-show the broken electrodes): the normalised adaptivity gap is 0.52, with a 95 % interval from 0.28 to
-0.82 over the 50 episodes of the leaderboard (`docs/injection.md`).
+show the broken electrodes): the normalised adaptivity gap is 0.52, with a 95 % interval from
+0.28 to 0.82 over the 50 episodes of the leaderboard (`docs/injection.md`).
 """)
 
 # -- 2D pipe with rare slugs --
@@ -378,8 +378,9 @@ agent may observe slugs at the inlet, on their way or in the region; the positio
 entered is as uncertain as the velocity that carries it.
 
 This environment is a competition: the normalised adaptivity gap is 1.04, with a 95 % interval
-from 0.70 to 1.96 over the 30 episodes of the leaderboard. No hand-written adaptive policy outperforms random
-pairs, which are as good as the best cycle; trained agents do (`docs/injection.md`).
+from 0.70 to 1.96 over the 30 episodes of the leaderboard. No hand-written adaptive policy
+outperforms random pairs, which are as good as the best cycle; trained agents do
+(`docs/injection.md`).
 """)
 
 # -- Stirred tank in which an agent injects --
