@@ -104,7 +104,7 @@ def test_what_the_readme_shows_works(installed, empty):
 def test_an_agent_s_record_asks_for_its_model(installed, empty, tmp_path):
     """An error names an agent that is not part of the package; a copy of its model is identified as built-in."""
     said = installed("-m", "eitbench.cli", "verify", AGENT, "--episodes", "1", cwd=empty, code=1)
-    assert "models of our trained agents are in a checkout only" in said
+    assert "checkpoints of built-in agents are in a checkout only" in said
     record = read_record(RESULTS / AGENT)
     ours = builtin_files(record["environment"]["id"])[record["method"]]
     copy = shutil.copy(ours, tmp_path / "model.zip")
