@@ -129,8 +129,8 @@ def test_the_prior_belief_is_the_expected_concentration():
     """A belief without data is linear about the expected concentration, at which both derivatives agree."""
     env = environment(NAME)
     belief = Belief.from_prior(env.rules)
-    assert filter_of(belief).concentration[0] == pytest.approx(env.world.expected_concentration, rel=1e-12)
-    level = filter_of(belief).concentration[0]
+    assert filter_of(belief).c_ref[0] == pytest.approx(env.world.expected_concentration, rel=1e-12)
+    level = filter_of(belief).c_ref[0]
     assert np.abs(belief.mean / level - 1.0).max() < 0.01
     np.testing.assert_allclose(belief.relinearised_jacobian(), belief.jacobian, rtol=0.1,
                                atol=0.02 * np.abs(belief.jacobian).max())

@@ -49,7 +49,7 @@ def test_method_and_score_make_a_record_and_a_board(installed):
     eitbench(installed, "leaderboard", "--records", str(records))
     with open(records.parent / "leaderboard.csv", encoding="utf-8") as file:
         rows = {row["method"]: row for row in csv.DictReader(file)}
-    assert float(rows["bubble_tracker"]["bubble_distance"]) == pytest.approx(1e3 * np.mean(distance), 1e-5)
+    assert float(rows["bubble_tracker"]["bubble_distance"]) == pytest.approx(np.mean(distance), 1e-5)
     said = eitbench(installed, "compare", "bubble_tracker", "gauss_newton", "--records", str(records),
                     "--score", "bubble_distance")
     assert said.startswith("A: bubble_tracker\n") and "distance of A" in said
