@@ -11,23 +11,23 @@ import numpy as np
 from eitbench import Estimate, Task
 from eitbench.estimation import FilterEstimator, compatible_models, compatible_priors, inflow_filter
 
-HERE = Path(__file__).parent
+BASELINE_DIR = Path(__file__).parent
 LINK = "logarithm"
-MODELS = HERE / "models" / "linearised"
+MODELS = BASELINE_DIR / "models" / "linearised"
 
 
 class Estimator:
     subtracks = ("filter", "fixed-lag")
 
     def __init__(self, task: Task) -> None:
-        prior = compatible_priors(HERE / "priors", task, LINK)[0]
+        prior = compatible_priors(BASELINE_DIR / "priors", task, LINK)[0]
         model = compatible_models(MODELS, task)[0]
         self.estimator = FilterEstimator(
             task, lambda c_ref: inflow_filter(task, prior, c_ref, task.lag, model=model))
 
     @staticmethod
     def suits(task: Task) -> bool:
-        known_inlet = bool(compatible_priors(HERE / "priors", task, LINK))
+        known_inlet = bool(compatible_priors(BASELINE_DIR / "priors", task, LINK))
         return task.velocity is None and known_inlet and bool(compatible_models(MODELS, task))
 
     def update(self, voltages: np.ndarray, currents: np.ndarray) -> Estimate | None:

@@ -32,12 +32,12 @@ from eitbench.estimation.inflow_prior import nominal_worlds, source_world
 from eitbench.estimation.walk import RandomWalk
 from eitbench.physics.stationary import StationaryTransport
 
-HERE = Path(__file__).parent
+BASELINE_DIR = Path(__file__).parent
 BOUNDS = (0.05, 4.0)
 """Bounds of the axial velocity, relative to the nominal one."""
 WINDOW = 30
 """Length of a window of inflows and velocities, in time steps."""
-FACTOR_STD = 0.3
+VELOCITY_FACTOR_STD = 0.3
 """Standard deviation of the velocity factor without an identified model."""
 LEVEL_STD = 0.05
 """Standard deviation of the inflow between rare slugs, relative to the homogeneous estimate."""
@@ -46,11 +46,12 @@ LEVEL_STD = 0.05
 class Estimator:
     subtracks = ("filter", "fixed-lag", "smoothing")
     parameters = {  # noqa: RUF012 (as a record has it)
-        "bounds": list(BOUNDS), "window": WINDOW, "factor_std": FACTOR_STD, "level_std": LEVEL_STD}
+        "bounds": list(BOUNDS), "window": WINDOW, "factor_std": VELOCITY_FACTOR_STD,
+        "level_std": LEVEL_STD}
 
     def __init__(self, task: Task) -> None:
-        prior = next(iter(compatible_priors(HERE / "priors", task, "logarithm")), None)
-        models = [model for model in compatible_models(HERE / "models", task)
+        prior = next(iter(compatible_priors(BASELINE_DIR / "priors", task, "logarithm")), None)
+        models = [model for model in compatible_models(BASELINE_DIR / "models", task)
                   if source_world(model.source) in nominal_worlds(task.world)]
         model = models[0] if models else None
         self.estimator: FilterEstimator | SmootherEstimator
@@ -63,8 +64,8 @@ class Estimator:
     @staticmethod
     def suits(task: Task) -> bool:
         """Return True for the filtering subtrack, and for tasks with an inflow prior."""
-        return not task.lag or (task.velocity is None
-                                and bool(compatible_priors(HERE / "priors", task, "logarithm")))
+        return not task.lag or (task.velocity is None and bool(
+            compatible_priors(BASELINE_DIR / "priors", task, "logarithm")))
 
     def update(self, voltages: np.ndarray, currents: np.ndarray) -> Estimate | None:
         return self.estimator.update(voltages, currents)
@@ -88,6 +89,6 @@ def choose(task: Task, c_ref: float, prior, model):
     if prior.regimes is not None and not task.lag:
         return SwitchingInflowFilter(task, prior, c_ref, LEVEL_STD, extended)
     if task.mesh.dim == 2 and not task.lag:
-        flow = scaled_velocity_prior(task, FACTOR_STD, 0.0)
+        flow = scaled_velocity_prior(task, VELOCITY_FACTOR_STD, 0.0)
         return Filter(VelocityInflowWindow(task, prior, c_ref, flow, WINDOW), extended)
     return inflow_filter(task, prior, c_ref, task.lag)

@@ -22,7 +22,7 @@ from eitbench.estimation import (
 PRIORS = Path(__file__).with_name("priors")
 LINK = "logarithm"
 MEMBERS = 256
-LEAD_IN = 30
+SPIN_UP_STEPS = 30
 """Spin-up: time steps until the members' inflows fill the pipe."""
 BOUNDS = (0.05, 4.0)
 """Bounds of the axial velocity, relative to its prior mean."""
@@ -33,14 +33,14 @@ SEED = 0
 class Estimator:
     subtracks = ("filter",)
     parameters = {  # noqa: RUF012 (as a record has it)
-        "members": MEMBERS, "lead_in": LEAD_IN, "bounds": list(BOUNDS), "seed": SEED}
+        "members": MEMBERS, "lead_in": SPIN_UP_STEPS, "bounds": list(BOUNDS), "seed": SEED}
 
     def __init__(self, task: Task) -> None:
         prior = compatible_priors(PRIORS, task, LINK)[0]
         flow = (scaled_velocity_prior(task, 0.0, 0.0) if task.velocity is None
                 else task_velocity_prior(task, BOUNDS))
         self.estimator = FilterEstimator(task, lambda c_ref: EnsembleFilter(
-            task, prior, c_ref, flow, MEMBERS, LEAD_IN, np.random.default_rng(SEED),
+            task, prior, c_ref, flow, MEMBERS, SPIN_UP_STEPS, np.random.default_rng(SEED),
             linearise_at_prediction(task)))
 
     @staticmethod

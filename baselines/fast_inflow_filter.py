@@ -24,7 +24,7 @@ PRIORS = Path(__file__).with_name("priors")
 LINK = "logarithm"
 MODES = 160
 """Number of concentration modes; the 3D projection error is 0.02 %, the filter's error 0.12 %."""
-BENT = 48
+N_QUADRATIC_MODES = 48
 """Number of leading modes in which voltages are quadratic."""
 
 
@@ -52,4 +52,4 @@ class Estimator:
 def reduced(transport, observation, level, prior):
     """Return the reduced response and voltage model, computed once for all episodes."""
     response = reduced_response(steady_response(transport), prior, MODES)
-    return response, ScaledVoltageModel(observation, level, response.basis[:, :BENT])
+    return response, ScaledVoltageModel(observation, level, response.basis[:, :N_QUADRATIC_MODES])

@@ -13,13 +13,13 @@ import numpy as np
 from eitbench import Estimate, Task
 from eitbench.estimation import FilterEstimator, linearise_at_reference, nodal_filter
 
-FACTORS = tuple(np.linspace(0.5, 1.5, 9).tolist())
+VELOCITY_FACTORS = tuple(np.linspace(0.5, 1.5, 9).tolist())
 WINDOW = 16  # injections
 
 
 class Estimator:
     subtracks = ("filter",)
-    parameters = {"factors": list(FACTORS), "window": WINDOW}  # noqa: RUF012 (as a record has it)
+    parameters = {"factors": list(VELOCITY_FACTORS), "window": WINDOW}  # noqa: RUF012 (as a record has it)
 
     def __init__(self, task: Task) -> None:
         self.estimator = FilterEstimator(task, lambda c_ref: FilterBank(task, c_ref))
@@ -52,11 +52,11 @@ class FilterBank:
     def estimate(self, lag: int = 0) -> Estimate:
         best = int(np.sum(self.misfits[-WINDOW:], axis=0).argmin())
         estimate = self.filters[best].estimate()
-        return estimate._replace(velocity=FACTORS[best] * self.nominal)
+        return estimate._replace(velocity=VELOCITY_FACTORS[best] * self.nominal)
 
 
 @lru_cache(maxsize=2)
 def transports(transport, flow):
     """Return the transport model for each velocity; cached, so that episodes share derived data."""
     return [transport.with_velocity(flow.field(factor * np.array(flow.nominal)))
-            for factor in FACTORS]
+            for factor in VELOCITY_FACTORS]

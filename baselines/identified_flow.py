@@ -19,15 +19,15 @@ from eitbench.estimation import (
     map_inflow,
 )
 
-HERE = Path(__file__).parent
+BASELINE_DIR = Path(__file__).parent
 
 
 class Estimator:
     subtracks = ("filter", "fixed-lag", "smoothing")
 
     def __init__(self, task: Task) -> None:
-        prior = compatible_priors(HERE / "priors", task, "logarithm")[0]
-        model = compatible_models(HERE / "models", task)[0]
+        prior = compatible_priors(BASELINE_DIR / "priors", task, "logarithm")[0]
+        model = compatible_models(BASELINE_DIR / "models", task)[0]
         self.estimator: FilterEstimator | SmootherEstimator
         if task.lag == task.n_steps - 1:
             self.estimator = SmootherEstimator(task, lambda c_ref, record: map_inflow(
@@ -38,8 +38,8 @@ class Estimator:
 
     @staticmethod
     def suits(task: Task) -> bool:
-        known_inlet = bool(compatible_priors(HERE / "priors", task, "logarithm"))
-        known_flow = bool(compatible_models(HERE / "models", task))
+        known_inlet = bool(compatible_priors(BASELINE_DIR / "priors", task, "logarithm"))
+        known_flow = bool(compatible_models(BASELINE_DIR / "models", task))
         return task.velocity is None and known_inlet and known_flow
 
     def update(self, voltages: np.ndarray, currents: np.ndarray) -> Estimate | None:

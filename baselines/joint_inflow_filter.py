@@ -25,7 +25,7 @@ WINDOW = 30
 """Number of past inflows in the state; the mean residence time is 18 steps."""
 BOUNDS = (0.05, 4.0)
 """Bounds of the axial velocity, relative to its prior mean."""
-FACTOR_STD = 0.3
+VELOCITY_FACTOR_STD = 0.3
 FACTOR_WALK = 0.0
 """Standard deviations of the initial factor and of its steps."""
 
@@ -33,13 +33,13 @@ FACTOR_WALK = 0.0
 class Estimator:
     subtracks = ("filter",)
     parameters = {  # noqa: RUF012 (as a record has it)
-        "window": WINDOW, "bounds": list(BOUNDS), "factor_std": FACTOR_STD,
+        "window": WINDOW, "bounds": list(BOUNDS), "factor_std": VELOCITY_FACTOR_STD,
         "factor_walk": FACTOR_WALK}
 
     def __init__(self, task: Task) -> None:
         prior = compatible_priors(PRIORS, task, LINK)[0]
-        flow = (scaled_velocity_prior(task, FACTOR_STD, FACTOR_WALK) if task.velocity is None
-                else task_velocity_prior(task, BOUNDS))
+        flow = (scaled_velocity_prior(task, VELOCITY_FACTOR_STD, FACTOR_WALK)
+                if task.velocity is None else task_velocity_prior(task, BOUNDS))
         self.estimator = FilterEstimator(task, lambda c_ref: Filter(
             VelocityInflowWindow(task, prior, c_ref, flow, WINDOW), linearise_at_prediction(task)))
 

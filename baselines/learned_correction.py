@@ -20,7 +20,7 @@ from eitbench.estimation import (
     network_matches_task,
 )
 
-HERE = Path(__file__).parent
+BASELINE_DIR = Path(__file__).parent
 NETWORK = "networks/pipe2d-biased.npz"
 
 
@@ -29,8 +29,8 @@ class Estimator:
     parameters = {"network": NETWORK}  # noqa: RUF012 (as a record has it)
 
     def __init__(self, task: Task) -> None:
-        network = load_network(HERE / NETWORK)
-        prior = compatible_priors(HERE / "priors", task, "logarithm")[0]
+        network = load_network(BASELINE_DIR / NETWORK)
+        prior = compatible_priors(BASELINE_DIR / "priors", task, "logarithm")[0]
         self.estimator = network_estimator(
             task, network,
             lambda level: FilterFeatures(task, prior, level, network["basis"]))
@@ -38,8 +38,8 @@ class Estimator:
     @staticmethod
     def suits(task: Task) -> bool:
         """Return True for tasks with the vessel, injections and flow model of the training."""
-        known_inlet = bool(compatible_priors(HERE / "priors", task, "logarithm"))
-        return known_inlet and network_matches_task(HERE / NETWORK, task)
+        known_inlet = bool(compatible_priors(BASELINE_DIR / "priors", task, "logarithm"))
+        return known_inlet and network_matches_task(BASELINE_DIR / NETWORK, task)
 
     def update(self, voltages: np.ndarray, currents: np.ndarray) -> Estimate | None:
         return self.estimator.update(voltages, currents)

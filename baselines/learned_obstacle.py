@@ -19,7 +19,7 @@ from eitbench.estimation import (
     network_matches_task,
 )
 
-HERE = Path(__file__).parent
+BASELINE_DIR = Path(__file__).parent
 NETWORK = "networks/pipe2d-obstacle.npz"
 
 
@@ -28,9 +28,9 @@ class Estimator:
     parameters = {"network": NETWORK}  # noqa: RUF012 (as a record has it)
 
     def __init__(self, task: Task) -> None:
-        network = load_network(HERE / NETWORK)
-        prior = compatible_priors(HERE / "priors", task, "logarithm")[0]
-        model = compatible_models(HERE / "models", task)[0]
+        network = load_network(BASELINE_DIR / NETWORK)
+        prior = compatible_priors(BASELINE_DIR / "priors", task, "logarithm")[0]
+        model = compatible_models(BASELINE_DIR / "models", task)[0]
         self.estimator = network_estimator(
             task, network,
             lambda level: FilterFeatures(task, prior, level, network["basis"], model=model))
@@ -38,9 +38,9 @@ class Estimator:
     @staticmethod
     def suits(task: Task) -> bool:
         """Return True for tasks with the vessel, injections and flow model of the training."""
-        known = (compatible_priors(HERE / "priors", task, "logarithm")
-                 and compatible_models(HERE / "models", task))
-        return bool(known) and network_matches_task(HERE / NETWORK, task)
+        known = (compatible_priors(BASELINE_DIR / "priors", task, "logarithm")
+                 and compatible_models(BASELINE_DIR / "models", task))
+        return bool(known) and network_matches_task(BASELINE_DIR / NETWORK, task)
 
     def update(self, voltages: np.ndarray, currents: np.ndarray) -> Estimate | None:
         return self.estimator.update(voltages, currents)

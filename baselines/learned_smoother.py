@@ -24,7 +24,7 @@ from eitbench.estimation import (
     network_matches_task,
 )
 
-HERE = Path(__file__).parent
+BASELINE_DIR = Path(__file__).parent
 NETWORK = "networks/pipe2d-smoothing.npz"
 LAG = 20
 """Time steps after which measurements hardly change the estimate of a state."""
@@ -36,22 +36,22 @@ class Estimator:
 
     def __init__(self, task: Task) -> None:
         self.task = task
-        self.network = load_network(HERE / NETWORK)
+        self.network = load_network(BASELINE_DIR / NETWORK)
         self.estimator = SmootherEstimator(task, self.read)
 
     @staticmethod
     def suits(task: Task) -> bool:
         """Return True for tasks with the vessel, injections and flow model of the training."""
-        known_inlet = bool(compatible_priors(HERE / "priors", task, "logarithm"))
+        known_inlet = bool(compatible_priors(BASELINE_DIR / "priors", task, "logarithm"))
         long_enough = task.n_steps > LAG
-        return long_enough and known_inlet and network_matches_task(HERE / NETWORK, task)
+        return long_enough and known_inlet and network_matches_task(BASELINE_DIR / NETWORK, task)
 
     def update(self, voltages: np.ndarray, currents: np.ndarray) -> Estimate | None:
         return self.estimator.update(voltages, currents)
 
     def read(self, c_ref: float, record) -> list[Estimate]:
         """Return the corrected states of a whole measurement sequence."""
-        prior = compatible_priors(HERE / "priors", self.task, "logarithm")[0]
+        prior = compatible_priors(BASELINE_DIR / "priors", self.task, "logarithm")[0]
         see = FilterFeatures(self.task, prior, c_ref, self.network["basis"], LAG)
         seen, (reduced,) = see.record(record, LAG)
         inputs = np.concatenate([seen, reduced], axis=1)

@@ -18,7 +18,7 @@ from eitbench.estimation import (
     network_matches_task,
 )
 
-HERE = Path(__file__).parent
+BASELINE_DIR = Path(__file__).parent
 NETWORK = "networks/pipe2d-voltages.npz"
 
 
@@ -27,14 +27,14 @@ class Estimator:
     parameters = {"network": NETWORK}  # noqa: RUF012 (as a record has it)
 
     def __init__(self, task: Task) -> None:
-        network = load_network(HERE / NETWORK)
+        network = load_network(BASELINE_DIR / NETWORK)
         self.estimator = network_estimator(
             task, network, lambda level: VoltageFeatures(task, level, network["basis"]))
 
     @staticmethod
     def suits(task: Task) -> bool:
         """Return True for tasks with the vessel and injections of the training."""
-        return network_matches_task(HERE / NETWORK, task)
+        return network_matches_task(BASELINE_DIR / NETWORK, task)
 
     def update(self, voltages: np.ndarray, currents: np.ndarray) -> Estimate | None:
         return self.estimator.update(voltages, currents)

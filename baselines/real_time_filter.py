@@ -21,23 +21,23 @@ from eitbench.estimation import (
     inflow_filter,
 )
 
-HERE = Path(__file__).parent
+BASELINE_DIR = Path(__file__).parent
 
 
 class Estimator:
     subtracks = ("filter",)
 
     def __init__(self, task: Task) -> None:
-        prior = compatible_priors(HERE / "priors", task, "logarithm")[0]
-        model = compatible_models(HERE / "models", task)[0]
+        prior = compatible_priors(BASELINE_DIR / "priors", task, "logarithm")[0]
+        model = compatible_models(BASELINE_DIR / "models", task)[0]
         task = replace(task, observation=quadratic(task.observation, model))
         self.estimator = FilterEstimator(
             task, lambda c_ref: inflow_filter(task, prior, c_ref, model=model))
 
     @staticmethod
     def suits(task: Task) -> bool:
-        known_inlet = bool(compatible_priors(HERE / "priors", task, "logarithm"))
-        known_flow = bool(compatible_models(HERE / "models", task))
+        known_inlet = bool(compatible_priors(BASELINE_DIR / "priors", task, "logarithm"))
+        known_flow = bool(compatible_models(BASELINE_DIR / "models", task))
         return task.velocity is None and known_inlet and known_flow
 
     def update(self, voltages: np.ndarray, currents: np.ndarray) -> Estimate | None:

@@ -20,7 +20,7 @@ from eitbench.envs.injection_core import InjectionCore
 from eitbench.estimation.onboard.belief import Belief
 from eitbench.estimation.onboard.rules import Rules
 
-NOTHING, CURRENTS = -1, -2
+NO_INJECTION, CURRENTS = -1, -2
 """Entries of plans for no injection and for the best currents; other entries are pairs."""
 
 
@@ -40,7 +40,7 @@ class Policy:
         self.rules = rules
         self.core = core
         if rules.world.velocity_model is not None and rules.budget is None:
-            self.plan = iter(self.changing().tolist())
+            self.plan = iter(self.best_switching_plan().tolist())
             return
         pairs = rules.pairs.tolist()
         every = np.ones(core.length, dtype=int)
@@ -51,13 +51,13 @@ class Policy:
             any_currents = load_method("best_currents", "injection")
             self.currents = np.array(any_currents.parameters["currents"], dtype=np.float32)
             options = fixed + [CURRENTS] * any_currents.suits(rules)
-            errors, plans = self.ahead(
+            errors, plans = self.rollout_plans(
                 np.array([self.greedy(), *(option * every for option in options)]))
         else:
             first, last, count = self.parameters["thresholds"]
             tried = product(fixed, np.geomspace(first, last, count), self.parameters["intervals"])
             pair, threshold, interval = (np.array(part) for part in zip(*tried, strict=True))
-            errors, plans = self.ahead(pair[:, None] * every, threshold, interval)
+            errors, plans = self.rollout_plans(pair[:, None] * every, threshold, interval)
         self.plan = iter(plans[errors.argmin()].tolist())
 
     def act(self, observation: dict[str, np.ndarray]) -> Any:
@@ -66,7 +66,7 @@ class Policy:
     def action(self, number: int) -> Any:
         if number == CURRENTS:
             return self.currents
-        return self.rules.action(None if number == NOTHING else number)
+        return self.rules.action(None if number == NO_INJECTION else number)
 
     def greedy(self, horizon: int = 0) -> np.ndarray:
         """Return the pairs (steps,) of healthy electrodes with the least posterior variance, summed
@@ -87,7 +87,7 @@ class Policy:
             covariance = belief.posterior_covariance(predicted, plan[k], sound)
         return plan
 
-    def changing(self) -> np.ndarray:
+    def best_switching_plan(self) -> np.ndarray:
         """Return the pairs (steps,) of the best plan, which may switch at fixed intervals between
         the candidate plans."""
         pairs = self.rules.pairs.tolist()
@@ -96,13 +96,13 @@ class Policy:
         cycles = [[pairs.index(pair) for pair in cycle] for cycle in options["cycles"]]
         plans = np.array([*map(self.greedy, options["horizons"]),
                           *(np.array(cycle)[steps % len(cycle)] for cycle in cycles)])
-        best = plans[self.ahead(plans)[0].argmin()]
+        best = plans[self.rollout_plans(plans)[0].argmin()]
         for begin in range(options["changes"], len(steps), options["changes"]):
             tried = np.concatenate([best[None], np.where(steps < begin, best, plans)])
-            best = tried[self.ahead(tried)[0].argmin()]
+            best = tried[self.rollout_plans(tried)[0].argmin()]
         return best
 
-    def ahead(self, plans: np.ndarray, threshold: np.ndarray | None = None,
+    def rollout_plans(self, plans: np.ndarray, threshold: np.ndarray | None = None,
               interval: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
         """Roll out plans (B, steps); return mean errors (B,) and executed plans (B, steps).
 
@@ -118,7 +118,7 @@ class Policy:
             if threshold is not None:
                 silent = (~(twin.errors() > threshold) | (k < last + interval)
                           | (twin.n_injections >= self.rules.budget))
-                plans[silent, k] = NOTHING
+                plans[silent, k] = NO_INJECTION
                 last[~silent] = k
             twin.act(np.array([self.action(number) for number in plans[:, k]]))
             errors.append(twin.errors())

@@ -17,13 +17,13 @@ CANDIDATES = 6
 """Number of candidate pairs at a step."""
 SWEEPS = 2
 """Number of sweeps over all steps."""
-AFTERWARDS = 16
+EVALUATION_HORIZON = 16
 """Number of steps over which an exchange is evaluated."""
 
 
 class Policy:
     parameters: dict[str, Any] = {  # noqa: RUF012
-        "candidates": CANDIDATES, "sweeps": SWEEPS, "afterwards": AFTERWARDS}
+        "candidates": CANDIDATES, "sweeps": SWEEPS, "afterwards": EVALUATION_HORIZON}
 
     @classmethod
     def suits(cls, rules: Rules) -> bool:
@@ -31,14 +31,14 @@ class Policy:
 
     def __init__(self, rules: Rules, random: np.random.Generator) -> None:
         self.rules = rules
-        self.plan = iter(plan_of(rules))
+        self.plan = iter(optimise_schedule(rules))
 
     def act(self, observation: dict[str, np.ndarray]) -> Any:
         return self.rules.action(next(self.plan))
 
 
 @lru_cache(maxsize=8)
-def plan_of(rules: Rules) -> tuple[int | None, ...]:
+def optimise_schedule(rules: Rules) -> tuple[int | None, ...]:
     """Return the pair of each step, None for no injection."""
     belief = Belief.from_prior(rules)
     steps = rules.world.n_steps - len(rules.world.currents)
@@ -54,7 +54,7 @@ def plan_of(rules: Rules) -> tuple[int | None, ...]:
     def cost(k: int, pairs: list[int | None]) -> float:
         covariance = states[k]
         total = 0.0
-        for pair in pairs + plan[k + len(pairs):k + AFTERWARDS]:
+        for pair in pairs + plan[k + len(pairs):k + EVALUATION_HORIZON]:
             covariance = follow(covariance, pair)
             total += covariance.trace()
         return total

@@ -7,7 +7,7 @@ import numpy as np
 
 from eitbench.estimation.onboard.rules import Rules
 
-DOWN = 3
+AXIAL_OFFSET = 3
 """Downstream offset of the sink electrode, in electrodes."""
 
 
@@ -16,7 +16,8 @@ class Policy:
         self.rules = rules
         half = rules.world.currents.shape[1] // 2
         numbers = {frozenset(pair): k for k, pair in enumerate(rules.pairs.tolist())}
-        self.cycle = cycle(numbers[frozenset((i, half + (i + DOWN) % half))] for i in range(half))
+        self.cycle = cycle(numbers[frozenset((i, half + (i + AXIAL_OFFSET) % half))]
+                           for i in range(half))
 
     def act(self, observation: dict[str, np.ndarray]) -> Any:
         now = self.rules.is_injection_step(observation["left"])

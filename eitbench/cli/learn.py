@@ -112,6 +112,8 @@ def train(
     evaluations.npz (scores on dev episodes) and logs for TensorBoard.
     """
     from dataclasses import replace
+
+    import numpy as np
     with options.cli_errors():
         from eitbench.rl import training
         asked = training.read_config(config)
@@ -119,7 +121,11 @@ def train(
             asked = replace(asked, total_steps=steps)
         folder = out or Path("results/training") / env.replace("/", "-") / algo / f"seed{seed}"
         model = training.train(env, algo.value, asked, seed, folder)
-    options.echo(f"wrote {model}")
+    errors = np.load(folder / "evaluations.npz")["errors"][-1]
+    options.echo(f"wrote {model}: ẽ_c {errors.mean():.3g} in {len(errors)} dev episodes, with the "
+                 "reduced filter")
+    options.echo(f"next: eitbench run --env {env} --policy {model} --policy random_pair "
+                 "--seeds dev:0-15")
 
 
 @fit.command("prior")

@@ -40,9 +40,9 @@ def isosurface(mesh: Mesh, values: np.ndarray, level: float) -> np.ndarray:
     return np.concatenate(triangles)
 
 
-def draw_isosurfaces(axes: Axes, mesh: Mesh, values: np.ndarray, poor: float, rich: float) -> None:
-    """Draw the surfaces of ``poor`` (blue) and ``rich`` (orange) mol/m³ in the pipe's outline."""
-    surfaces = [isosurface(mesh, values, level) for level in (poor, rich)]
+def draw_isosurfaces(axes: Axes, mesh: Mesh, values: np.ndarray, low: float, high: float) -> None:
+    """Draw the surfaces of ``low`` (blue) and ``high`` (orange) mol/m³ in the pipe's outline."""
+    surfaces = [isosurface(mesh, values, level) for level in (low, high)]
     colours = np.repeat([LOW_COLOUR, HIGH_COLOUR], list(map(len, surfaces)))
     _draw(axes, np.concatenate(surfaces), colours, 0.5)
     _outline(axes, mesh)

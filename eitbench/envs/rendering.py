@@ -121,11 +121,11 @@ def draw_frame(task: Task, truth_mesh: Mesh, truth: np.ndarray, estimate: np.nda
         panels[2].set_xlabel(f"{'z' if solid else 'x'} / cm    (flow →;   {current})")
     if solid:
         from eitbench.envs.isosurface import draw_electrodes_in_space, draw_isosurfaces
-        poor, rich = 1.08 * task.expected_concentration, 1.36 * task.expected_concentration
+        low, high = 1.08 * task.expected_concentration, 1.36 * task.expected_concentration
         for row, (mesh, values) in enumerate([(truth_mesh, truth), (task.mesh, estimate)]):
             axes = figure.add_subplot(grid[row, 1])
-            draw_isosurfaces(axes, mesh, values, poor, rich)
-            axes.set_title(f"{poor:.0f} (blue) and {rich:.0f} (orange) mol/m³", fontsize=10)
+            draw_isosurfaces(axes, mesh, values, low, high)
+            axes.set_title(f"{low:.0f} (blue) and {high:.0f} (orange) mol/m³", fontsize=10)
         draw_electrodes_in_space(figure.add_subplot(grid[2, 1]), task.observation.cem, currents,
                                  (SOURCE, SINK, IDLE))
     return _pixels(figure)

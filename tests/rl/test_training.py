@@ -17,8 +17,9 @@ from eitbench.rl.vec_env import InjectionVecEnv
 from eitbench.worlds.catalogue import PIPE_2D
 from threadpoolctl import threadpool_limits
 
+from commands import eitbench
 from injection_envs import injected
-from short import merged
+from short import PIPE, merged, shorten
 
 NAME = "eitbench/Pipe2DInjection-v0"
 CURRENTS, BUDGET = "eitbench/Pipe2DInjectionCurrents-v0", "eitbench/Pipe2DInjectionBudget-v0"
@@ -237,3 +238,16 @@ def test_rewards_of_a_reference_are_subtracted(tmp_path):
         assert np.abs(expected).max() > 1e-3
         np.testing.assert_allclose([ours.step(action)[1] for action in actions], expected, atol=1e-6)
     np.testing.assert_array_equal(training.policy_rewards("random_pair", world, tmp_path / "reference.npy"), reference)
+
+
+def test_the_command_prints_the_score_and_the_next_command(monkeypatch, tmp_path):
+    """The score is the mean error in the dev episodes of the last evaluation."""
+    shorten(monkeypatch, {NAME: PIPE})
+    config = tmp_path / "config.yml"
+    config.write_text("total_steps: 16\nn_envs: 2\ninterval: 16\nevaluation_episodes: 2\nepisodes: 2\nhidden: [8]\n"
+                      "algorithm: {n_steps: 8, batch_size: 8}\n")
+    code, said, complaint = eitbench("train", "--env", NAME, "--config", config, "--out", tmp_path / "run")
+    assert code == 0, complaint
+    errors = np.load(tmp_path / "run" / "evaluations.npz")["errors"][-1]
+    assert f"ẽ_c {errors.mean():.3g} in 2 dev episodes" in said
+    assert f"next: eitbench run --env {NAME} --policy {tmp_path / 'run' / 'model.zip'}" in said
