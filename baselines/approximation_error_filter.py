@@ -1,5 +1,5 @@
-"""Filter with voltages that are linearised once, and an approximation error: the mean and
-covariance, over training episodes, of the errors of linearisation, mesh and assumed velocity.
+"""Kalman filter with fixed linearisation and approximation error: the mean and covariance, over
+training episodes, of the errors of linearisation, mesh and assumed velocity.
 
 The inflow's logarithm has a coloured Gaussian prior, also fitted to training episodes.
 """

@@ -1,4 +1,5 @@
-"""Automatic choice: the state space and the linearisation follow from what the task specifies.
+"""Automatic choice of the filter: the state space and the linearisation follow from what the task
+specifies.
 
 An unknown velocity is estimated with the inflow. An identified model replaces the nominal flow;
 with only a prior of the inflow, the nominal velocity is scaled by an unknown factor. Rare slugs

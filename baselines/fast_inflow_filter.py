@@ -1,5 +1,5 @@
-"""Filter of the inflow's logarithm that keeps pace with the instrument in 3D: `log_inflow_filter`
-in the leading directions of the response to inflows, with voltages quadratic in them.
+"""Real-time filter of the log-inflow in 3D: `log_inflow_filter` in the leading directions of the
+response to inflows, with voltages quadratic in them.
 
 It uses the task's flow and a prior of the inflow fitted to training episodes.
 """

@@ -1,5 +1,5 @@
-"""Fixed-interval Kalman smoother (thesis 5.1.2): the Kalman filter and a backward pass over all
-measurements."""
+"""Fixed-interval Kalman smoother: the Kalman filter and a backward pass over all measurements
+(thesis 5.1.2)."""
 
 from collections.abc import Sequence
 

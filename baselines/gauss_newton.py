@@ -1,5 +1,5 @@
-"""Stationary Gauss–Newton (thesis 5.11): reconstruction of each frame of 16 injections under the
-assumption of a stationary target.
+"""Stationary Gauss–Newton: reconstruction of each frame of 16 injections under the assumption of a
+stationary target (thesis 5.11).
 
 In the filtering subtrack, the frame consists of the latest 16 injections; in the smoothing subtrack
 each state gets the image of the frame that contains it, as in the thesis (Fig. 5.6). ALPHA was

@@ -1,5 +1,5 @@
-"""Filter and smoother with a flow that training episodes have shown: the impulse response of the
-pipe and the errors of states and voltages are identified from training episodes.
+"""Filter and smoother with identified flow: the impulse response of the pipe and the errors of
+states and voltages are identified from training episodes.
 
 The inflow's logarithm has a coloured Gaussian prior. The filter, also with a fixed lag, linearises
 each measurement vector twice. The smoother computes the most probable inflow.

@@ -1,4 +1,4 @@
-"""Smoother of the inflow's logarithm: the most probable inflow given all measurements, by nonlinear
+"""Smoother of the log-inflow: the most probable inflow given all measurements, by nonlinear
 Gauss–Newton, with a coloured prior fitted to training episodes.
 """
 

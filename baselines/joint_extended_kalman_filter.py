@@ -1,4 +1,4 @@
-"""Joint extended Kalman filter (thesis ch. 6): concentration and velocity parameters in one state.
+"""Joint extended Kalman filter: concentration and velocity parameters in one state (thesis ch. 6).
 
 The velocity is updated with every injection from the first frame on. Across the pipe it is kept
 between 0.05 and 4 times its prior mean, to exclude backflow and divergence of the estimate.

@@ -1,5 +1,5 @@
-"""Linearised Kalman filter (thesis 5.1.2): linearised about ĉ_bh of the first frame, with the
-parameters of Table 5.1."""
+"""Linearised Kalman filter: linearised about ĉ_bh of the first frame, with the parameters of Table
+5.1 (thesis 5.1.2)."""
 
 import numpy as np
 

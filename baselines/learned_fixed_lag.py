@@ -1,5 +1,5 @@
-"""Recurrent network that corrects what the log-inflow filter thinks of a state four measurements
-later: trained on training episodes.
+"""Recurrent network that corrects the fixed-lag estimates of the log-inflow filter: trained on
+training episodes, for a lag of four measurements.
 
 The network is as in `learned_correction`; its inputs include the filter's present estimates of the
 present state and of the state four steps ago. `studies/learn.py` trains it; inference needs numpy

@@ -1,5 +1,5 @@
-"""Recurrent network that reads the whole record from both ends, and corrects what the log-inflow
-filter estimates of each state 20 measurements later: trained on training episodes.
+"""Bidirectional recurrent network that corrects fixed-lag estimates of the log-inflow filter: the
+lag is 20 measurements; trained on training episodes.
 
 The inputs of the bidirectional GRU (Schuster & Paliwal 1997, Cho et al. 2014) are the filter's
 innovations and its estimates at that time and 20 steps later, in modes of training concentrations.

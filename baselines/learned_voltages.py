@@ -1,5 +1,5 @@
-"""Recurrent network that knows no model of the flow: estimation from voltages alone, trained on
-training episodes.
+"""Recurrent network without a flow model: estimation from voltages alone, trained on training
+episodes.
 
 The inputs of the GRU (Cho et al. 2014) are the deviations of the voltages from a homogeneous fluid,
 its outputs the modes of the concentration and their variances. `studies/learn.py` trains it;

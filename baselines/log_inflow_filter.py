@@ -1,4 +1,4 @@
-"""Extended Kalman filter of the inflow's logarithm: a Gaussian prior, correlated in time and across
+"""Extended Kalman filter of the log-inflow: a Gaussian prior, correlated in time and across
 the inlet, fitted to training episodes; voltages are linearised about each prediction."""
 
 from pathlib import Path

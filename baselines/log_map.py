@@ -1,4 +1,4 @@
-"""Maximum a posteriori for the logarithm of the concentration: nonlinear Gauss–Newton over all
+"""Maximum a posteriori estimate of the log-concentration: nonlinear Gauss–Newton over all
 injections so far.
 
 For stationary targets with a conductivity contrast of many times the background, such as metal and

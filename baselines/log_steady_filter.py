@@ -1,4 +1,5 @@
-"""Extended Kalman filter of the logarithm, for a target that stands still or moves steadily.
+"""Extended Kalman filter of the log-concentration with smooth motion: for stationary or steadily
+moving targets.
 
 For measurements of real instruments: as `log_walk_filter`, but the logarithm is a Matérn 3/2
 process in time, with the rate that maximises the likelihood of some frames. The state holds the

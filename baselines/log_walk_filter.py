@@ -1,4 +1,5 @@
-"""Extended Kalman filter of the logarithm, for a target that stands still or walks at random.
+"""Extended Kalman filter of the log-concentration with random-walk motion: for stationary targets
+and unknown motion.
 
 For measurements of real instruments, with unknown motion of the target and a conductivity contrast
 of many times the background: estimates are positive. The logarithm has the initial covariance and

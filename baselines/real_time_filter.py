@@ -1,6 +1,5 @@
-"""Filter that keeps pace with the instrument: flow and inflow prior as in `identified_flow`, with
-voltages as a quadratic function of the concentration's logarithm, about c_ref of the training
-episodes.
+"""Real-time filter with identified flow: flow and inflow prior as in `identified_flow`, with
+voltages as a quadratic function of the log-concentration, about c_ref of the training episodes.
 
 A step takes less than the 5 ms between two injections, on one core.
 """

@@ -1,4 +1,4 @@
-"""Unscented Kalman filter of the inflow's logarithm: as `log_inflow_filter`, but with the complete
+"""Unscented Kalman filter of the log-inflow: as `log_inflow_filter`, but with the complete
 electrode model evaluated at sigma points along the principal axes of the concentration.
 """
 

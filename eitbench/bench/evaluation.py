@@ -17,14 +17,14 @@ from eitbench.bench.run import Job
 from eitbench.bench.runner import run_method
 from eitbench.bench.scores import compute_scores
 from eitbench.bench.suites import isolated_job
-from eitbench.bench.tracks import Environment
+from eitbench.bench.tracks import Environment, qualified_name
 from eitbench.data.parallel import run_parallel
 from eitbench.data.seeds import format_seed, parse_seeds
 
 
 def evaluate(method: Any, env: str | gym.Env, seeds: str | Iterable[int], *,
-             world: dict[str, Any] | None = None, n_jobs: int = 1,
-             isolate: str | None = None) -> pd.DataFrame:
+             world: dict[str, Any] | None = None, estimator: str | None = None,
+             n_jobs: int = 1, isolate: str | None = None) -> pd.DataFrame:
     """Run a method on episodes and compute the same scores as the commands.
 
     By default the method's code runs in this process, with all its rights: it can access the ground
@@ -33,23 +33,29 @@ def evaluate(method: Any, env: str | gym.Env, seeds: str | Iterable[int], *,
     ``method`` is a class ``Estimator`` or ``Policy`` as in a method's file, the name of a built-in
     method, or the path of a file; ``env`` a registered id, or an environment made by
     `gymnasium.make`, whose arguments are used; ``seeds`` such as ``"dev:0-9"``, or numbers;
-    ``world`` the argument of `gymnasium.make` that changes the world. ``isolate`` is the option of
+    ``world`` and ``estimator`` are arguments of `gymnasium.make`: changes of the world, and the
+    filter inside an injection environment (default: "full"). ``isolate`` is the option of
     ``eitbench run``, for a method given by name or path.
 
     Returns
     -------
     DataFrame
         A row for each seed: environment, method, seed (as ``dev:3``), and each score by its name,
-        in SI units as in ``leaderboards/schema.json``; None where the method gives no value.
+        in SI units as in ``leaderboards/schema.json``; None where the method gives no value. For
+        policies also ``return``, the sum of the rewards.
 
     ``ValueError`` if an argument is invalid, or the method is incompatible with the environment.
     Exceptions of the method propagate, with a note that names the episode.
     """
-    asked = resolve_environment(env, world)
-    if isolate is None:
-        runner: Method | Job = resolve_method(method, asked.track)
-    elif isinstance(method, str | Path):
-        runner = isolated_job(asked, str(method), isolate)
+    asked = resolve_environment(env, world=world, estimator=estimator)
+    if estimator is not None and asked.track != "injection":
+        raise ValueError(f"estimator must be None for {asked.id}, where the method is the "
+                         f"estimator, got {estimator!r}")
+    if isinstance(method, str | Path):         # a worker loads it: its module cannot be pickled
+        runner: Method | Job = isolated_job(asked, str(method), isolate or "none")
+        _method(runner)                        # an invalid file is reported before a worker starts
+    elif isolate is None:
+        runner = resolve_method(method, asked.track)
     else:
         raise ValueError("method must be a name or a path to be isolated, got "
                          f"{type(method).__name__}")
@@ -72,16 +78,21 @@ def _method(runner: Method | Job) -> Method:
 def _row(asked: Environment, runner: Method | Job, seed: int) -> dict[str, Any]:
     method = _method(runner)
     try:
-        outcome = run_method(asked, method, seed).outcome
+        run = run_method(asked, method, seed)
     except Exception as error:
         error.add_note(f"{method.name} on {asked.id}, {format_seed(seed)}")
         raise
-    return {"environment": asked.name, "method": method.name, "seed": format_seed(seed),
-            **compute_scores(method.track, outcome)}
+    name = qualified_name({"id": asked.id, "name": asked.name})
+    row = {"environment": name, "method": method.name, "seed": format_seed(seed)}
+    if run.episode_return is not None:
+        row["return"] = run.episode_return
+    return row | compute_scores(method.track, run.outcome)
 
 
-def resolve_environment(given: str | gym.Env, world: dict[str, Any] | None) -> Environment:
-    changes = {} if world is None else {"world": world}
+def resolve_environment(given: str | gym.Env, **kwargs: Any) -> Environment:
+    """Return the environment of an id, or made by `gymnasium.make`, with the ``kwargs`` that are
+    not None."""
+    changes = {name: value for name, value in kwargs.items() if value is not None}
     if isinstance(given, str):
         return Environment(given, json.dumps(changes))
     spec = getattr(given, "spec", None)

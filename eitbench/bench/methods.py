@@ -352,7 +352,8 @@ def load_module(kind: str, path: Path, source: bytes) -> ModuleType:
 
 
 def title_of(module: ModuleType, path: Path) -> str:
-    """Return the first line of the docstring, up to a colon, bracket or full stop, and at most
+    """Return the docstring up to a colon or the end of the first sentence, and at most
     `MAX_TITLE_CHARS` characters; without a docstring the file's name."""
-    line = f"{(module.__doc__ or '').strip()}\n".splitlines()[0]
-    return re.split(r"[:(.]", line)[0].strip()[:MAX_TITLE_CHARS].strip() or path.stem
+    paragraph = " ".join((module.__doc__ or "").strip().split("\n\n")[0].split())
+    title = re.split(r"[.:](?:\s|$)", paragraph)[0]
+    return title[:MAX_TITLE_CHARS].strip() or path.stem

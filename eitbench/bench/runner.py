@@ -48,6 +48,8 @@ class EpisodeRun(NamedTuple):
     policies and on measurements."""
     actions: list[Any] | None = None
     """actions of a policy, JSON-ready"""
+    episode_return: float | None = None
+    """sum of the rewards of a policy"""
 
 
 def cached_environment(asked: Environment) -> Any:
@@ -126,22 +128,24 @@ def _run_policy(env: InjectionEnv, policy: Method, seed: int) -> EpisodeRun:
     claims = list[ScoredEstimate]()
     actions = list[Any]()
     # `iter_injections` does not measure the time of this loop's body
-    for t, observation, elapsed in iter_injections(env, policy, seed, actions):
+    total = 0.0
+    for t, observation, elapsed, reward in iter_injections(env, policy, seed, actions):
         seconds += elapsed
+        total += reward
         currents.append(observation["currents"])
         if (error := env.error) is not None:
             means, stds = env.core.estimate()
             claims.append(ScoredEstimate(t, error, means[0], stds[0], env.core.innovations()[0]))
     spent = sum(bool(each.any()) for each in currents)
     outcome = injection_outcome(env.core.world, seed, claims, seconds / env.core.length, spent)
-    return EpisodeRun(outcome, np.array(currents), {}, actions)
+    return EpisodeRun(outcome, np.array(currents), {}, actions, total)
 
 
 def iter_injections(env: InjectionEnv, policy: Method, seed: int, actions: list[Any] | None = None,
-               ) -> Iterator[tuple[int, dict[str, np.ndarray], float]]:
-    """Yield (t of the observed state, observation, seconds of the policy) after each injection of
-    one episode. The first time includes the policy's constructor. Actions are appended to
-    ``actions``. Errors as in `run_method`."""
+               ) -> Iterator[tuple[int, dict[str, np.ndarray], float, float]]:
+    """Yield (t of the observed state, observation, seconds of the policy, reward) after each
+    injection of one episode. The first time includes the policy's constructor. Actions are appended
+    to ``actions``. Errors as in `run_method`."""
     if not policy.suits(env.rules):
         raise ValueError(f"policy {policy.name} does not suit {env.spec.id if env.spec else env}")
     with allow_test_seeds():
@@ -154,11 +158,11 @@ def iter_injections(env: InjectionEnv, policy: Method, seed: int, actions: list[
     while not done:
         action = player.act(observation)
         seconds = time.perf_counter() - begin
-        observation, _, done, _, _ = env.step(action)
+        observation, reward, done, _, _ = env.step(action)
         if actions is not None:
             actions.append(np.asarray(action).tolist())
         t += 1
-        yield t, observation, seconds
+        yield t, observation, seconds, float(reward)
         begin = time.perf_counter()
 
 

@@ -42,7 +42,7 @@ def list_() -> None:
     """List environments, built-in estimators and policies, with their subtracks."""
     from eitbench.bench.methods import builtin_methods, load_method
     from eitbench.bench.tracks import ids, measured_ids, subtracks_of
-    from eitbench.worlds.registry import GROUPS, entry
+    from eitbench.worlds.registry import GROUPS, entry, published_returns
     from eitbench.worlds.task import lag_steps
     lines = []
     for group in GROUPS:
@@ -57,6 +57,9 @@ def list_() -> None:
                 about += f", at most {schedule.budget} injections"
             if each.nominal:
                 about += f", shifted variant {each.variant} of {each.nominal}"
+            if returns := published_returns(name):
+                about += ", returns " + ", ".join(f"{row['group']} {float(row['mean']):.3g}"
+                                                  for row in returns)
             about += ", recommended to new users" * each.is_starting_point
             lines.append((f"  {name}", subtracks_of(name, {})[0], about))
     lines.append(("environments: measured data", "", ""))

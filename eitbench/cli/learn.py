@@ -109,7 +109,8 @@ def train(
     """Train an agent to choose injections.
 
     The same command resumes from the last checkpoint. The folder receives model.zip, config.json,
-    evaluations.npz (scores on dev episodes) and logs for TensorBoard.
+    evaluations.npz (scores on dev episodes), K.monitor.csv (training episodes of the K-th start)
+    and logs for TensorBoard.
     """
     from dataclasses import replace
 
@@ -121,8 +122,9 @@ def train(
             asked = replace(asked, total_steps=steps)
         folder = out or Path("results/training") / env.replace("/", "-") / algo / f"seed{seed}"
         model = training.train(env, algo.value, asked, seed, folder)
-    errors = np.load(folder / "evaluations.npz")["errors"][-1]
-    options.echo(f"wrote {model}: ẽ_c {errors.mean():.3g} in {len(errors)} dev episodes, with the "
+    last = {name: values[-1] for name, values in np.load(folder / "evaluations.npz").items()}
+    options.echo(f"wrote {model}: ẽ_c {last['errors'].mean():.3g}, return "
+                 f"{last['results'].mean():.3g} in {len(last['errors'])} dev episodes, with the "
                  "reduced filter")
     options.echo(f"next: eitbench run --env {env} --policy {model} --policy random_pair "
                  "--seeds dev:0-15")

@@ -13,7 +13,7 @@ from typing import Any
 import gymnasium as gym
 from gymnasium import spaces
 
-from eitbench.worlds.registry import entry
+from eitbench.worlds.registry import entry, published_returns
 from eitbench.worlds.world import World
 
 KEY_DESCRIPTIONS = {
@@ -32,6 +32,12 @@ KEY_DESCRIPTIONS = {
 }
 """Meaning of each entry of an observation."""
 
+RETURNS_TEXT = """
+Mean sum of rewards in the episodes dev:0–31 with the reduced filter, that is
+`gym.make(id, split="dev")`, ± half its 95 % interval. `spec.reward_threshold` is the return of the
+best open-loop or adaptive policy. Made by `python studies/returns.py`.
+"""
+
 
 def describe_environment(id: str) -> str:
     """Compose the page of a registered id as Markdown; ``ValueError`` if the id is unknown."""
@@ -42,8 +48,20 @@ def describe_environment(id: str) -> str:
     shown = env.core.raw_space() if registered.track == "injection" else env.observation_space
     parts = ["## Description", registered.description.strip(), _overview(env),
              sections[:observation].strip(), _observation_table(shown, env.world),
-             sections[observation:].strip(), "## World", _world_table(registered.world)]
+             sections[observation:].strip(), *_returns_table(id),
+             "## World", _world_table(registered.world)]
     return "\n\n".join(parts) + "\n"
+
+
+def _returns_table(id: str) -> list[str]:
+    """Return the section of published returns; empty without any."""
+    rows = published_returns(id)
+    if not rows:
+        return []
+    lines = [f"| {row['group']} | `{row['policy']}` | {row['mean']} ± {row['half_width']} |"
+             for row in rows]
+    return ["## Returns", RETURNS_TEXT.strip(),
+            "\n".join(["| group | best policy | return |", "|---|---|---:|", *lines])]
 
 
 page = describe_environment

@@ -93,12 +93,31 @@ class EpisodeCore(ABC):
         """Take valid actions (B, …) and return the rewards (B,)."""
 
     @abstractmethod
+    def errors(self) -> np.ndarray:
+        """Return the relative errors (5.12) of the last estimates (B,), NaN where not scored."""
+
+    @abstractmethod
     def observe(self) -> Observation:
         """Return observations in SI units, new arrays (B, …)."""
 
     def format(self) -> Any:
         """Return observations in `observation_space`, with a leading axis B."""
         return self.observe()
+
+    @abstractmethod
+    def picture(self, b: int) -> tuple[int, np.ndarray, np.ndarray | None, np.ndarray]:
+        """Return t of the last estimate of episode ``b``, the estimate (n,), its standard deviation
+        (n,) if known, and the currents (L,)."""
+
+    def draw(self, b: int, task: Task) -> np.ndarray:
+        """(height, width, 3) uint8: truth, estimate, its standard deviation, electrodes."""
+        with require_extra("render()"):
+            from eitbench.envs.rendering import draw_frame
+        t, estimate, std, currents = self.picture(b)
+        world = self.world
+        truth = concentration_at(world, self.seeds[b], t, self.n_initial + 1)
+        return draw_frame(task, truth_mesh(world), truth, estimate, std, currents,
+                          t * world.time_step, world.region)
 
 
 class FixedLengthEnv(gym.Env[Any, Any]):  # type: ignore[misc]
@@ -122,18 +141,25 @@ class FixedLengthEnv(gym.Env[Any, Any]):  # type: ignore[misc]
     def spec(self, made_from: EnvSpec | None) -> None:
         self._spec = made_from and replace(made_from, max_episode_steps=self.episode_steps)
 
-    def check_render(self, render_mode: str | None) -> None:
-        """Set the render mode; ``ValueError`` if it does not exist."""
-        if render_mode not in (None, *RENDER_MODES):
-            raise ValueError(f"render_mode must be None or one of {RENDER_MODES}, "
-                             f"got {render_mode!r}")
-        self.render_mode = render_mode
 
-    def can_render(self) -> bool:
-        """Return whether an image can be drawn; warn without a mode."""
-        if self.render_mode is None:
-            gym.logger.warn("render() needs gym.make(..., render_mode='rgb_array')")
-        return self.render_mode is not None
+def check_render_mode(render_mode: str | None) -> str | None:
+    """Return the render mode; ``ValueError`` if it does not exist."""
+    if render_mode not in (None, *RENDER_MODES):
+        raise ValueError(f"render_mode must be None or one of {RENDER_MODES}, got {render_mode!r}")
+    return render_mode
+
+
+def can_render(render_mode: str | None) -> bool:
+    """Return whether an image can be drawn; warn without a mode."""
+    if render_mode is None:
+        gym.logger.warn("render() needs gym.make(..., render_mode='rgb_array')")
+    return render_mode is not None
+
+
+def truth_mesh(world: World) -> Mesh:
+    """Return the mesh of the ground truth."""
+    from eitbench.data.episodes import cached_truth_model
+    return cached_truth_model(world).transport.mesh
 
 
 class EpisodeEnv(FixedLengthEnv):
@@ -145,7 +171,7 @@ class EpisodeEnv(FixedLengthEnv):
 
     def __init__(self, core: EpisodeCore, episodes: int | None, split: str,
                  render_mode: str | None) -> None:
-        self.check_render(render_mode)
+        self.render_mode = check_render_mode(render_mode)
         self.pool = EpisodeSampler(episodes, split)
         """episodes of unseeded resets"""
         self.core = core
@@ -180,7 +206,7 @@ class EpisodeEnv(FixedLengthEnv):
         warn_test_seeds([number])
         self.core.reset([number], self.pool.ensure_simulated)
         self._step = 1
-        return self._observe(), {"step": 1}
+        return self._observe(), self._info()
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Take an action; ``ValueError`` if it is not in the action space."""
@@ -189,7 +215,11 @@ class EpisodeEnv(FixedLengthEnv):
         reward = float(self.core.act(self._checked(action))[0])
         self._step += 1
         ended = self._step > self.episode_steps
-        return self._observe(), reward, ended, False, {"step": self._step}
+        return self._observe(), reward, ended, False, self._info()
+
+    def _info(self) -> dict[str, Any]:
+        error = float(self.core.errors()[0])
+        return {"step": self._step} | ({} if np.isnan(error) else {"error": error})
 
     def _observe(self) -> Any:
         shown = self.core.format()
@@ -203,24 +233,14 @@ class EpisodeEnv(FixedLengthEnv):
     def render(self) -> np.ndarray | None:  # type: ignore[override]
         """(height, width, 3) uint8: truth, estimate, its standard deviation, electrodes; None
         without a mode."""
-        if not self.can_render():
+        if not can_render(self.render_mode):
             return None
         self.require_reset("render()")
-        with require_extra("render()"):
-            from eitbench.envs.rendering import draw_frame
-        t, estimate, spread, currents = self._picture()
-        truth = concentration_at(self.world, self.core.seeds[0], t, self.core.n_initial + 1)
-        return draw_frame(self.task, self.truth_mesh(), truth, estimate, spread, currents,
-                          t * self.world.time_step, self.world.region)
-
-    def _picture(self) -> tuple[int, np.ndarray, np.ndarray | None, np.ndarray]:
-        """Return t, the estimate of its state, the standard deviation, and the currents (L,)."""
-        raise NotImplementedError
+        return self.core.draw(0, self.task)
 
     def truth_mesh(self) -> Mesh:
         """Return the mesh of the ground truth."""
-        from eitbench.data.episodes import cached_truth_model
-        return cached_truth_model(self.world).transport.mesh
+        return truth_mesh(self.world)
 
     def require_reset(self, caller: str) -> None:
         """Raise ``ResetNeeded`` before the first episode."""
@@ -237,11 +257,14 @@ class EpisodeVectorEnv(gym.vector.VectorEnv[Any, np.ndarray, np.ndarray]):
     counts the resets of all environments together; in ``SyncVectorEnv`` each counts separately.
     """
 
-    metadata = {"render_modes": [], "autoreset_mode": AutoresetMode.NEXT_STEP}  # noqa: RUF012
+    metadata = {"render_modes": RENDER_MODES, "render_fps": 8,  # noqa: RUF012
+                "autoreset_mode": AutoresetMode.NEXT_STEP}
+    _task_options: dict[str, Any] = {}  # noqa: RUF012 (replaced, not changed)
 
     def __init__(self, make_core: Callable[[], EpisodeCore], num_envs: int, episodes: int | None,
-                 split: str, max_episode_steps: int | None, *, threads: int = 1,
-                 core_episodes: int = MAX_CORE_EPISODES) -> None:
+                 split: str, render_mode: str | None, max_episode_steps: int | None, *,
+                 threads: int = 1, core_episodes: int = MAX_CORE_EPISODES) -> None:
+        self.render_mode = check_render_mode(render_mode)
         self.num_envs = _check.integer("num_envs", num_envs, low=1)
         self.pool = EpisodeSampler(episodes, split)
         """episodes of unseeded resets"""
@@ -269,13 +292,26 @@ class EpisodeVectorEnv(gym.vector.VectorEnv[Any, np.ndarray, np.ndarray]):
         self._map = self._executor.map if self._executor else map
 
     def __getstate__(self) -> dict[str, Any]:
-        """Return everything but the threads: a copy has separate ones."""
+        """Return everything but the threads and the task: a copy makes separate ones."""
         return {name: value for name, value in vars(self).items()
-                if name not in ("_executor", "_map")}
+                if name not in ("_executor", "_map", "task")}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         vars(self).update(state)
         self._start_threads()
+
+    @cached_property
+    def task(self) -> Task:
+        """Information for an estimator; built on first use."""
+        return make_task(self.world, **self._task_options)
+
+    def render(self) -> tuple[np.ndarray, ...] | None:  # type: ignore[override]
+        """Draw each episode as `EpisodeEnv.render` does; None without a mode."""
+        if not can_render(self.render_mode):
+            return None
+        if self._step == 0:
+            raise gym.error.ResetNeeded("call reset() before render()")
+        return tuple(core.draw(b, self.task) for core in self.cores for b in range(len(core.seeds)))
 
     def close_extras(self, **kwargs: Any) -> None:
         """Stop the threads."""
@@ -350,6 +386,13 @@ class EpisodeVectorEnv(gym.vector.VectorEnv[Any, np.ndarray, np.ndarray]):
         return {name: np.concatenate([part[name] for part in shown]) for name in shown[0]}
 
     def _info(self) -> dict[str, Any]:
-        return {"step": np.full(self.num_envs, self._step),
-                "_step": np.ones(self.num_envs, dtype=bool)}
+        info = {"step": np.full(self.num_envs, self._step)}
+        errors = self.errors()
+        if not np.isnan(errors).all():
+            info["error"] = errors
+        return info | {f"_{name}": np.ones(self.num_envs, dtype=bool) for name in info}
+
+    def errors(self) -> np.ndarray:
+        """(num_envs,) relative errors (5.12), NaN if not scored; for scoring, never for agents."""
+        return np.concatenate([core.errors() for core in self.cores])
 

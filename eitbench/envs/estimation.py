@@ -44,6 +44,9 @@ class PrivilegedInfo(NamedTuple):
 class EstimationCore(EpisodeCore):
     """B episodes with the world's cycle of injections, whose actions are estimates."""
 
+    estimate_std: np.ndarray | None = None
+    """(n,) standard deviation of the last estimate in mol/m³ for images, if the caller has one"""
+
     def __init__(self, world: World, lag: int) -> None:
         super().__init__(world)
         self.lag = lag
@@ -68,6 +71,9 @@ class EstimationCore(EpisodeCore):
     def reset(self, seeds: Sequence[int],
               provide: Callable[[World, int], None] | None = None) -> None:
         self._step = 1
+        self._errors = np.full(len(seeds), np.nan)
+        self._estimates = np.full((len(seeds), self.n_nodes), self.world.expected_concentration)
+        self.estimate_std = None
         super().reset(seeds, provide)
 
     def _read(self, recordings: Sequence[np.ndarray]) -> None:
@@ -92,16 +98,28 @@ class EstimationCore(EpisodeCore):
         world = self.world
         k = self._step - self.lag - 1
         self._step += 1
+        if k >= 0:
+            self._estimates = actions[:, :self.n_nodes].copy()
+        self._errors = np.full(len(actions), np.nan)
         if k < world.warm_up:
             return np.zeros(len(actions))
         estimates, parameters = np.split(actions, [self.n_nodes], axis=1)
         moments = np.stack([each[k - world.warm_up] for each in self._moments])
-        errors = step_error(score_mass(world), estimates - world.background, moments,
-                            self._deviations[k], self._squares[k])
+        self._errors = step_error(score_mass(world), estimates - world.background, moments,
+                                  self._deviations[k], self._squares[k])
+        rewards = -self._errors
         if world.velocity_model is not None:
             moments, squares = (np.stack([flow[i][k] for flow in self._flows]) for i in range(2))
-            errors = errors + velocity_error(world.velocity_model, parameters, moments, squares)
-        return -errors
+            rewards = rewards - velocity_error(world.velocity_model, parameters, moments, squares)
+        return rewards
+
+    def errors(self) -> np.ndarray:
+        return self._errors
+
+    def picture(self, b: int) -> tuple[int, np.ndarray, np.ndarray | None, np.ndarray]:
+        t = min(max(self._step - 1 - self.lag, 0), self.world.n_steps)
+        currents = self.currents[t - 1] if t else np.zeros(self.currents.shape[1])
+        return t, self._estimates[b], self.estimate_std, currents
 
     def observe(self) -> Observation:
         self.load_until(self._step)
@@ -129,7 +147,8 @@ class EstimationEnv(EpisodeEnv):
 
     −∫(ĉ_t − c_t)² dΩ / ∫c_t² dΩ for each scored state t, 0 for the others: minus the mean over the
     scored states is the relative error ẽ_c (thesis 5.12). Where the flow is estimated too,
-    −∫(v̂_t − v_t)² dy / ∫v_t² dy across the pipe is added.
+    −∫(v̂_t − v_t)² dy / ∫v_t² dy across the pipe is added. For scored states `info["error"]` is the
+    relative error of the concentration.
 
     ## Starting State
 
@@ -160,34 +179,23 @@ class EstimationEnv(EpisodeEnv):
                  world: dict[str, Any] | None = None, lag: int | str | None = None,
                  assume: dict[str, Any] | None = None, episodes: int | None = None,
                  split: str = "train", render_mode: str | None = None) -> None:
-        played, self.lag, assumed = resolve_arguments(entry(name, variant), world, lag, assume)
-        super().__init__(EstimationCore(played, self.lag), episodes, split, render_mode)
+        resolved, self.lag, assumed = resolve_arguments(entry(name, variant), world, lag, assume)
+        super().__init__(EstimationCore(resolved, self.lag), episodes, split, render_mode)
         self._task_options = {"lag": self.lag, **assumed}
         self.n_nodes = self.core.n_nodes
         """nodes of the mesh of the estimates"""
-        self.estimate_std: np.ndarray | None = None
-        """(n,) standard deviation of the last estimate in mol/m³, if the caller has one"""
-        self._last: np.ndarray | None = None
 
-    def reset(self, *, seed: int | None = None,
-              options: dict[str, Any] | None = None) -> tuple[Observation, dict[str, Any]]:
-        """Begin the episode with this seed (`eitbench.data.seeds`), or a random training one."""
-        self.estimate_std = self._last = None
-        return super().reset(seed=seed, options=options)
+    @property
+    def estimate_std(self) -> np.ndarray | None:
+        """Standard deviation of the last estimate, see `EstimationCore`."""
+        return self.core.estimate_std
+
+    @estimate_std.setter
+    def estimate_std(self, std: np.ndarray | None) -> None:
+        self.core.estimate_std = std
 
     def _checked(self, action: Any) -> np.ndarray:
-        checked = check_actions(action, self.action_space, self.n_nodes)
-        if self._step > self.lag:
-            self._last = checked[:self.n_nodes].copy()
-        return checked[None]
-
-    def _picture(self) -> tuple[int, np.ndarray, np.ndarray | None, np.ndarray]:
-        t = min(max(self._step - 1 - self.lag, 0), self.world.n_steps)
-        estimate = self._last
-        if estimate is None:
-            estimate = np.full(self.n_nodes, self.world.expected_concentration)
-        currents = self.core.currents[t - 1] if t else np.zeros(self.core.currents.shape[1])
-        return t, estimate, self.estimate_std, currents
+        return check_actions(action, self.action_space, self.n_nodes)[None]
 
     def truth(self) -> np.ndarray:
         """(T, n_truth) concentration in mol/m³, t = 1 … T; for scoring, never for agents."""
@@ -221,10 +229,12 @@ class EstimationVectorEnv(EpisodeVectorEnv):
     def __init__(self, name: str, *, num_envs: int = 1, variant: str | None = None,
                  world: dict[str, Any] | None = None, lag: int | str | None = None,
                  assume: dict[str, Any] | None = None, episodes: int | None = None,
-                 split: str = "train", max_episode_steps: int | None = None) -> None:
-        played, lag, _ = resolve_arguments(entry(name, variant), world, lag, assume)
-        super().__init__(lambda: EstimationCore(played, lag), num_envs, episodes,
-                         split, max_episode_steps)
+                 split: str = "train", render_mode: str | None = None,
+                 max_episode_steps: int | None = None) -> None:
+        resolved, lag, assumed = resolve_arguments(entry(name, variant), world, lag, assume)
+        super().__init__(lambda: EstimationCore(resolved, lag), num_envs, episodes, split,
+                         render_mode, max_episode_steps)
+        self._task_options = {"lag": lag, **assumed}
 
     def _checked(self, actions: np.ndarray) -> np.ndarray:
         return check_actions(actions, self.action_space, self.cores[0].n_nodes)

@@ -35,7 +35,8 @@ class InjectionEnv(EpisodeEnv):
     For each scored state ∫(ĉ_bh − c_t)² dΩ / ∫c_t² dΩ − ∫(ĉ_t − c_t)² dΩ / ∫c_t² dΩ, the error of
     the homogeneous estimate, which no injection changes, minus the filter's error; 0 for the other
     states. The score is ẽ_c (thesis 5.12), the mean of the second term; where the world has a
-    `region`, both integrals are over the region. With `estimator="none"` the reward is 0.
+    `region`, both integrals are over the region. With `estimator="none"` the reward is 0. For
+    scored states `info["error"]` is the second term.
 
     ## Starting State
 
@@ -82,10 +83,6 @@ class InjectionEnv(EpisodeEnv):
             return np.array([number])
         return _check.array("action", action, space.shape or ())[None]
 
-    def _picture(self) -> tuple[int, np.ndarray, np.ndarray | None, np.ndarray]:
-        mean, spread = self.core.estimate()
-        return self.core.t, mean[0], spread[0], self.core.currents[0]
-
     def action_masks(self) -> np.ndarray:
         """(actions,) bool: numbered actions that have an effect; only the last one, without an
         injection, when the budget is used up."""
@@ -113,20 +110,16 @@ class InjectionVectorEnv(EpisodeVectorEnv):
     def __init__(self, name: str, *, num_envs: int = 1, variant: str | None = None,
                  world: dict[str, Any] | None = None, estimator: str = "reduced",
                  observation: str = "scaled", gate: float | None = None, inflow: str | None = None,
-                 episodes: int | None = None, split: str = "train", threads: int = 1,
-                 max_episode_steps: int | None = None) -> None:
+                 episodes: int | None = None, split: str = "train", render_mode: str | None = None,
+                 threads: int = 1, max_episode_steps: int | None = None) -> None:
         self.rules = rules = resolve_rules(entry(name, variant), world, gate, inflow, estimator)
         super().__init__(lambda: InjectionCore(rules, estimator, observation), num_envs, episodes,
-                         split, max_episode_steps, threads=threads,
+                         split, render_mode, max_episode_steps, threads=threads,
                          core_episodes=num_envs if estimator == "none" else MAX_CORE_EPISODES)
 
     def action_masks(self) -> np.ndarray:
         """(num_envs, actions) as in `InjectionEnv`."""
         return np.concatenate([core.action_masks() for core in self.cores])
-
-    def errors(self) -> np.ndarray:
-        """(num_envs,) relative errors (5.12), NaN if not scored; for scoring, never for agents."""
-        return np.concatenate([core.errors() for core in self.cores])
 
     def _checked(self, actions: np.ndarray) -> np.ndarray:
         chosen = np.asarray(actions)

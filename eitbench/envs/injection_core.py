@@ -130,6 +130,7 @@ class InjectionCore(EpisodeCore):
         """V and A (A/m in 2D), (B, L) each, of the last injections"""
         self._recent = np.zeros((B, N_RECENT_CURRENTS, L))
         self._homogeneous: np.ndarray | None = None
+        self._errors: np.ndarray | None = None
         faults = [instrument_faults(world, seed) for seed in seeds]
         self.faults = Faults(*(np.array(part) for part in zip(*faults, strict=True)))
         """faults of the instrument in these episodes, (B, L) each"""
@@ -186,6 +187,7 @@ class InjectionCore(EpisodeCore):
             self.n_injections += currents.any(axis=1)
         self.currents = currents
         self.load_until(self.t + 1)
+        self._errors = None
         self._voltages = self._measure(self.t, currents)
         self._recent = np.concatenate([currents[:, None], self._recent[:, :-1]], axis=1)
         self.t += 1
@@ -207,9 +209,11 @@ class InjectionCore(EpisodeCore):
         the state is not scored."""
         if self.t <= self.world.warm_up or not self._filters_type:
             return np.full(len(self.n_injections), np.nan)
-        k = self.t - 1
-        return self._filters.errors(self._moments[:, k], self._deviations[:, k],
-                                     self._squares[:, k])
+        if self._errors is None:
+            k = self.t - 1
+            self._errors = self._filters.errors(self._moments[:, k], self._deviations[:, k],
+                                                self._squares[:, k])
+        return self._errors
 
     def estimate(self) -> tuple[np.ndarray, np.ndarray]:
         """Present means and standard deviations (B, n) in mol/m³; without an estimator the expected
@@ -218,6 +222,10 @@ class InjectionCore(EpisodeCore):
             shape = (len(self.n_injections), scoring_constants(self.world).mass.shape[0])
             return np.full(shape, self.world.expected_concentration), np.zeros(shape)
         return self._filters.means(), self._filters.stds()
+
+    def picture(self, b: int) -> tuple[int, np.ndarray, np.ndarray | None, np.ndarray]:
+        means, stds = self.estimate()
+        return self.t, means[b], stds[b], self.currents[b]
 
     def innovations(self) -> list[Innovation | None]:
         """Innovations of the measurements that the filters accepted last, by episode; for scores,

@@ -13,7 +13,14 @@ from gymnasium import spaces
 
 from eitbench import _check
 from eitbench._extras import require_extra
-from eitbench.envs.episodes import RENDER_MODES, RESET_NEEDED, FixedLengthEnv, Observation
+from eitbench.envs.episodes import (
+    RENDER_MODES,
+    RESET_NEEDED,
+    FixedLengthEnv,
+    Observation,
+    can_render,
+    check_render_mode,
+)
 from eitbench.envs.estimation import check_actions
 from eitbench.measured import Measurements, quality, read
 from eitbench.measured.calibration import calibrate, noise_from_frames
@@ -91,7 +98,7 @@ class MeasuredEnv(FixedLengthEnv):
                  moves: bool | None = None, correction: str = "offset",
                  homogeneous_frames: int = 1, render_mode: str | None = None,
                  **options: Any) -> None:
-        self.check_render(render_mode)
+        self.render_mode = check_render_mode(render_mode)
         measurements = file if isinstance(file, Measurements) else read(file)
         self.vessel = vessel if isinstance(vessel, VesselConfig) else read_vessel(vessel)
         self.case: MeasuredCase | None = None
@@ -193,7 +200,7 @@ class MeasuredEnv(FixedLengthEnv):
     def render(self) -> np.ndarray | None:  # type: ignore[override]
         """(height, width, 3) uint8: last estimate, its standard deviation if known, electrodes;
         None without a mode."""
-        if not self.can_render():
+        if not can_render(self.render_mode):
             return None
         if self._step == 0:
             raise gym.error.ResetNeeded("call reset() before render()")

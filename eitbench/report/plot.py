@@ -88,7 +88,7 @@ def episode(method: Any, env: str | gym.Env, seed: int | str, *,
         If an argument is wrong, or the method does not suit the environment.
     """
     import matplotlib.pyplot as plt
-    asked = resolve_environment(env, world)
+    asked = resolve_environment(env, world=world)
     loaded = resolve_method(method, asked.track)
     number = parse_single_seed(seed)
     made = asked.make()

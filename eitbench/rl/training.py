@@ -1,8 +1,11 @@
 """Train an injection agent with stable-baselines3, resuming from the last checkpoint.
 
 A configuration is a YAML file such as the files of ``baselines/rl/``. A run writes to its folder
-``config.json`` (its arguments), ``model.zip`` (the agent), ``evaluations.npz`` (scores on dev
-episodes over time), ``sha256`` of the model, and logs for TensorBoard.
+``config.json`` (its arguments), ``model.zip`` (the agent), ``sha256`` of the model, logs for
+TensorBoard, and two files in the formats of stable-baselines3: ``K.monitor.csv`` with the training
+episodes of its K-th start, whose returns have ``reward_scale`` and ``reference`` applied, and
+``evaluations.npz`` with ``timesteps`` (k,), and with returns ``results``, ``ep_lengths`` and the
+relative errors ``errors`` (k, episodes) on dev episodes, without discount.
 
 Policies in a configuration (``reference``, ``imitate.teacher``) run in this process, without
 isolation.
@@ -33,6 +36,7 @@ from sb3_contrib import MaskablePPO, RecurrentPPO
 from stable_baselines3 import DQN, PPO, SAC
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.monitor import ResultsWriter
 from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import VecEnv, VecMonitor
 from threadpoolctl import threadpool_limits
@@ -182,6 +186,9 @@ def train(env: str, algo: str, config: TrainingConfig, seed: int, folder: Path,
         model.set_random_seed(seed + model.num_timesteps)  # loading restored the first seed
     # written after all cheap checks
     write_atomically(settings, json.dumps(asked, indent=1).encode())
+    start = len(list(folder.glob("*.monitor.csv")))
+    learning.results_writer = ResultsWriter(
+        str(folder / f"{start}.monitor.csv"), header={"t_start": learning.t_start, "env_id": env})
     if config.reference:
         inner.reference = policy_rewards(config.reference, world, folder / "reference.npy")
     if is_new:
@@ -233,14 +240,16 @@ def policy_rewards(policy: str, world: InjectionEnv, path: Path) -> np.ndarray:
 
 
 def make_evaluator(env: str, kwargs: dict[str, Any] | None,
-               config: TrainingConfig) -> Callable[[BaseAlgorithm], np.ndarray]:
-    """Return a function that computes ẽ_c of a model with deterministic actions in each of the
-    first dev episodes, with the reduced filter."""
+                   config: TrainingConfig,
+                   ) -> Callable[[BaseAlgorithm], tuple[np.ndarray, np.ndarray, np.ndarray]]:
+    """Return a function that computes ẽ_c, return and length of each of the first dev episodes for
+    deterministic actions of a model, with the reduced filter."""
     seeds: Any = list(SPLITS["dev"])[:config.evaluation_episodes]
     envs = vector_env(env, kwargs, config, len(seeds))
 
-    def evaluate(model: BaseAlgorithm) -> np.ndarray:
+    def evaluate(model: BaseAlgorithm) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         observation, _ = envs.reset(seed=seeds)
+        returns = np.zeros(len(seeds))
         state = None
         errors: list[np.ndarray] = []
         ended = False
@@ -249,12 +258,13 @@ def make_evaluator(env: str, kwargs: dict[str, Any] | None,
                 else {}
             actions, state = model.predict(observation, state, np.full(len(seeds), not errors),
                                            deterministic=True, **how)
-            observation, _, done, _, _ = envs.step(actions)
+            observation, rewards, done, _, _ = envs.step(actions)
+            returns += rewards
             errors.append(envs.errors())
             ended = bool(done.all())
         # unscored states are NaN in all episodes, failed estimates in some
         scored = np.array([row for row in errors if not np.isnan(row).all()])
-        return scored.mean(axis=0)
+        return scored.mean(axis=0), returns, np.full(len(seeds), len(errors))
 
     return evaluate
 
@@ -313,11 +323,11 @@ class _Checkpoints(BaseCallback):
     """Callback that evaluates and stores the agent at every interval and at the end."""
 
     def __init__(self, folder: Path, interval: int,
-                 errors_of: Callable[[BaseAlgorithm], np.ndarray]) -> None:
+                 evaluator: Callable[[BaseAlgorithm], tuple[np.ndarray, ...]]) -> None:
         super().__init__()
         self.folder = folder
         self.interval = interval
-        self.errors_of = errors_of
+        self.evaluator = evaluator
 
     def _on_training_start(self) -> None:
         self._next = (self.num_timesteps // self.interval + 1) * self.interval
@@ -329,20 +339,25 @@ class _Checkpoints(BaseCallback):
         return True
 
     def _on_training_end(self) -> None:
-        self.logger.record("eval/relative_error", float(self.evaluate(self.model).mean()))
+        errors, returns = self.evaluate(self.model)
+        self.logger.record("eval/relative_error", float(errors.mean()))
+        self.logger.record("eval/mean_reward", float(returns.mean()))
         save_model(self.model, self.folder / "latest.zip")
 
-    def evaluate(self, model: BaseAlgorithm) -> np.ndarray:
-        """Append the errors (episodes,) to the table, and remove rows of the same or a larger
-        number of steps, which belong to lost checkpoints."""
-        errors = self.errors_of(model)
+    def evaluate(self, model: BaseAlgorithm) -> tuple[np.ndarray, np.ndarray]:
+        """Append errors and returns (episodes,) to the table, and remove rows of the same or a
+        larger number of steps, which belong to lost checkpoints."""
+        errors, returns, lengths = self.evaluator(model)
+        row = {"timesteps": model.num_timesteps, "results": returns, "ep_lengths": lengths,
+               "errors": errors}
         path = self.folder / "evaluations.npz"
-        table = {"steps": np.zeros(0, int), "errors": np.zeros((0, len(errors)))}
+        table = {name: np.zeros((0, *np.shape(value)), int if name == "timesteps" else float)
+                 for name, value in row.items()}
         if path.exists():
             table = dict(np.load(path))
-        kept = table["steps"] < model.num_timesteps
+        kept = table["timesteps"] < model.num_timesteps
         content = io.BytesIO()
-        np.savez(content, steps=np.append(table["steps"][kept], model.num_timesteps),
-                 errors=np.vstack([table["errors"][kept], errors]))
+        np.savez(content, **{name: np.concatenate([table[name][kept], np.array([value])])
+                             for name, value in row.items()})
         write_atomically(path, content.getvalue())
-        return errors
+        return errors, returns

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import csv
 import json
 import re
 import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import lru_cache
 from importlib.metadata import entry_points
+from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
@@ -28,6 +31,8 @@ ID_SETTINGS = {"estimation": ("lag", "assume"), "injection": ("gate", "inflow")}
 """Track -> arguments of its environment that an id may fix, besides the world."""
 GROUPS = ("thesis examples", "extensions", "robustness variants", "injection", "user-defined")
 """Groups of ids in lists of environments."""
+RETURNS = Path(__file__).with_name("returns.csv")
+"""Mean returns of policies in the built-in injection environments, made by studies/returns.py."""
 EARLIER_KEYWORDS = {"about": "description", "seeds": "test_seeds", "home": "nominal"}
 """Earlier keyword of `register` -> its keyword."""
 
@@ -60,6 +65,13 @@ class Entry:
         name, nominal = (id.split("/")[-1].rpartition("-v")[0] for id in (self.id, self.nominal))
         words = re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "-", name.removeprefix(nominal))
         return words.lower() if nominal else ""
+
+    @property
+    def reward_threshold(self) -> float | None:
+        """Mean return of the best hand-written policy in `published_returns`."""
+        returns = [float(row["mean"]) for row in published_returns(self.id)
+                   if row["group"] in ("open loop", "adaptive")]
+        return max(returns, default=None)
 
 
 _entries: dict[str, Entry] = {}
@@ -154,7 +166,20 @@ def _add(entry: Entry) -> None:
     if entry.id not in gym.registry:
         single, vector = ENV_CLASSES[entry.track]
         gym.register(entry.id, entry_point=single, vector_entry_point=vector,
-                     kwargs={"name": entry.id})
+                     reward_threshold=entry.reward_threshold, kwargs={"name": entry.id})
+
+
+@lru_cache(maxsize=1)
+def _returns() -> list[dict[str, str]]:
+    with RETURNS.open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def published_returns(id: str) -> list[dict[str, str]]:
+    """Return rows of an injection environment with the best random, open-loop, adaptive and trained
+    policy: group, policy, mean return over dev:0-31 with the reduced filter, and half the width of
+    its 95 % interval."""
+    return [row for row in _returns() if row["environment"] == id]
 
 
 def entries() -> dict[str, Entry]:

@@ -115,7 +115,7 @@ def _curves(axes: Axes, env: str) -> None:
     for run in runs:
         algo = json.loads((run.parent / "config.json").read_text())["algo"]
         evaluations = np.load(run)
-        axes.plot(1e-6 * evaluations["steps"], evaluations["errors"].mean(axis=1),
+        axes.plot(1e-6 * evaluations["timesteps"], evaluations["errors"].mean(axis=1),
                   color=colours[run.parts[-3]], linewidth=1.2,
                   label=None if algo in labelled else f"{algo}, reduced filter, dev episodes")
         labelled.add(algo)

@@ -43,7 +43,7 @@ def test_agents_reproduce_their_evaluation(path):
     assert agent.name == f"{asked['algo']}_{folder.name}" and folder.parts[-2] == asked["algo"]
     assert folder.parts[-3] == asked["env"].replace("/", "-") and asked["kwargs"] == {}
     kept = np.load(folder / "evaluations.npz")
-    assert kept["steps"][0] == 0 and kept["steps"][-1] >= asked["config"]["total_steps"]
+    assert kept["timesteps"][0] == 0 and kept["timesteps"][-1] >= asked["config"]["total_steps"]
     error = injected(asked["env"], {}, path, FIRST, "reduced").errors.mean()
     np.testing.assert_allclose(error, kept["errors"][-1][0], rtol=0.02)
 

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from eitbench import Estimate
 from eitbench.bench.run import Job, run_episode
-from eitbench.bench.tracks import Environment
 
 from short import PIPE, shorten
 from tiny import FILTER, SCENARIO, write_baseline
@@ -49,7 +48,7 @@ def test_scores_agree_with_the_commands(tmp_path):
     both = eitbench.evaluate(Level, FILTER.id, "dev:0-2", world=SCENARIO, n_jobs=2)
     for other in (file, made, both):
         assert without_time(other).equals(without_time(table))
-    assert set(table["environment"]) == {Environment(FILTER.id, FILTER.kwargs).name}
+    assert set(table["environment"]) == {f"{FILTER.id}{FILTER.name.removeprefix('eitbench-Pipe2D-v0')}"}
 
 
 def test_policies_too():
@@ -61,10 +60,20 @@ def test_policies_too():
         def act(self, observation):
             return 0
 
-    ours = eitbench.evaluate("random_pair", INJECTION, "dev:0-1")
+    ours = eitbench.evaluate("random_pair", INJECTION, "dev:0-1", n_jobs=2)
     mine = eitbench.evaluate(First, INJECTION, "dev:0-1")
     assert list(ours.columns) == list(mine.columns) and (ours["spent"] == mine["spent"]).all()
     assert (ours["error"] != mine["error"]).all()
+    env = gym.make(INJECTION)                               # its filter is the reduced one
+    env.reset(seed=100_000)
+    rewards, ended = [], False
+    while not ended:
+        _, reward, ended, _, _ = env.step(0)
+        rewards.append(reward)
+    reduced = eitbench.evaluate(First, INJECTION, "dev:0", estimator="reduced")
+    assert reduced["return"].item() == sum(rewards) and reduced["environment"].item() != mine["environment"][0]
+    with pytest.raises(ValueError, match=r"estimator must be None for eitbench/Pipe2D-v0"):
+        eitbench.evaluate(Level, FILTER.id, "dev:0", estimator="reduced")
 
 
 def test_exceptions_of_the_method_propagate():

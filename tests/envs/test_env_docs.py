@@ -31,7 +31,7 @@ def test_sections_and_sizes(described):
     id, text, env = described
     assert re.findall(r"^## (.*)$", text, re.MULTILINE) == [
         "Description", "Action Space", "Observation Space", "Rewards", "Starting State", "Episode End",
-        "Arguments", "World"]
+        "Arguments", *["Returns"] * (entries()[id].track == "injection"), "World"]
     assert section(text, "Description").startswith(entries()[id].description.strip())
     sizes = table(section(text, "Description"))
     world = env.world
@@ -44,6 +44,21 @@ def test_sections_and_sizes(described):
         assert sizes["gate"] == f"{entries()[id].settings.get('gate', float('inf')):g}"
     shapes = table(section(text, "Observation Space"))
     assert {name: shapes[name] for name in observed} == {name: str(space.shape) for name, space in observed.items()}
+
+
+def test_threshold_is_the_best_published_return(described):
+    """Each injection environment publishes the returns of four groups of policies, the random pair's as the least;
+    the threshold of its spec is the largest without training."""
+    id, text, _ = described
+    threshold = gym.spec(id).reward_threshold
+    if entries()[id].track != "injection":
+        assert threshold is None
+        return
+    returns = {group: float(value.split(" ± ")[0]) for group, value in table(section(text, "Returns"), 2).items()
+               if group != "group"}
+    assert {"random", "open loop", "adaptive"} <= set(returns)
+    assert threshold == max(returns["open loop"], returns["adaptive"])
+    assert returns["random"] == min(returns.values())
 
 
 def test_arguments_are_those_of_the_environment(described):

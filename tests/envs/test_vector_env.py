@@ -54,9 +54,13 @@ def assert_same_array(one, other):
 
 
 def assert_same_play(one, other):
-    """Require bit-identical values, except rewards, whose summation order differs."""
+    """Require bit-identical values, except rewards and errors, whose summation order differs."""
     assert len(one) == len(other)
     for mine, theirs in zip(one, other, strict=True):
+        errors = [each[4].pop("error", None) for each in (mine, theirs)]
+        if errors[0] is not None:
+            np.testing.assert_allclose(*errors, rtol=1e-12)
+            np.testing.assert_allclose(errors[0], -mine[1], rtol=1e-12)
         for a, b in ((mine[0], theirs[0]), (mine[4], theirs[4])):
             assert a.keys() == b.keys()
             for key in a:
@@ -104,6 +108,22 @@ def test_later_resets_are_those_of_scalar_environments(name):
         actions = actions_for(mine, 2 + 9 * (k % 2), seed=k)
         theirs = int(seed) if isinstance(seed, np.int64) else seed
         assert_same_play(play(mine, actions, seed=seed), play(sync, actions, seed=theirs))
+
+
+def test_images_are_those_of_scalar_environments():
+    """Images equal the images of gymnasium's SyncVectorEnv; without a render mode `render` returns None."""
+    images = []
+    for mode in ("vector_entry_point", "sync"):
+        envs = make(num_envs=2, mode=mode, render_mode="rgb_array")
+        envs.reset(seed=0)
+        envs.step(actions_for(envs, 1)[0])
+        images.append(envs.render())
+    for one, other in zip(*images, strict=True):
+        np.testing.assert_array_equal(one, other)
+    assert (images[0][0] != images[0][1]).any()
+    assert make().render() is None
+    with pytest.raises(gym.error.ResetNeeded, match=r"reset\(\) before render"):
+        make(render_mode="rgb_array").render()
 
 
 def test_seed_names_the_episode():

@@ -15,6 +15,7 @@ from eitbench.rl.agents import configuration_hash, load_agent
 from eitbench.rl.training import ALGORITHMS, TrainingConfig, read_config, train
 from eitbench.rl.vec_env import InjectionVecEnv
 from eitbench.worlds.catalogue import PIPE_2D
+from stable_baselines3.common.monitor import load_results
 from threadpoolctl import threadpool_limits
 
 from commands import eitbench
@@ -81,8 +82,13 @@ def test_every_algorithm_finishes_a_run(run):
     model = ALGORITHMS[algo].load(path)
     assert 32 <= model.num_timesteps < 48
     kept = np.load(folder / "evaluations.npz")
-    assert kept["steps"][0] == 0 and (np.diff(kept["steps"]) > 0).all() and kept["steps"][-1] == model.num_timesteps
-    np.testing.assert_allclose(kept["errors"][-1], training.make_evaluator(env, kwargs, config)(model), rtol=1e-6)
+    steps = kept["timesteps"]
+    assert steps[0] == 0 and (np.diff(steps) > 0).all() and steps[-1] == model.num_timesteps
+    errors, returns, lengths = training.make_evaluator(env, kwargs, config)(model)
+    np.testing.assert_allclose(kept["errors"][-1], errors, rtol=1e-6)
+    np.testing.assert_allclose(kept["results"][-1], returns, rtol=1e-6)
+    np.testing.assert_array_equal(kept["ep_lengths"][-1], lengths)
+    assert load_results(str(folder))["l"].isin(lengths).all()
     assert json.loads((folder / "config.json").read_text())["algo"] == algo
     assert not (getattr(model.policy, "actor", None) or model.policy).optimizer.state
     assert len((folder / "sha256").read_text()) == 64 and not (folder / "latest.zip").exists()
@@ -139,7 +145,8 @@ def test_a_killed_run_loses_no_more_than_an_interval(tmp_path, monkeypatch):
     assert calls == [16]
     path = train(NAME, "ppo", TINY, 1, tmp_path, SHORT)
     assert ALGORITHMS["ppo"].load(path).num_timesteps == 32
-    assert np.load(tmp_path / "evaluations.npz")["steps"].tolist() == [0, 16, 32]
+    assert np.load(tmp_path / "evaluations.npz")["timesteps"].tolist() == [0, 16, 32]
+    assert len(list(tmp_path.glob("*.monitor.csv"))) == 2
     with pytest.raises(ValueError, match="out must be an empty folder or one of the same run"):
         train(NAME, "ppo", TINY, 2, tmp_path, SHORT)
     content = path.read_bytes()
@@ -172,7 +179,7 @@ def test_failed_estimates_are_in_evaluations(monkeypatch):
 
     errors, factors = InjectionVectorEnv.errors, iter([[1, 1], [1, 1], [1, 1], [1, np.nan]])
     monkeypatch.setattr(InjectionVectorEnv, "errors", lambda self: errors(self) * next(factors))
-    assert list(np.isnan(training.make_evaluator(NAME, SHORT, TINY)(Still()))) == [False, True]
+    assert list(np.isnan(training.make_evaluator(NAME, SHORT, TINY)(Still())[0])) == [False, True]
 
 
 def test_imitation_learns_the_teachers_actions(tmp_path):
