@@ -1,7 +1,7 @@
 """Coverage of confidence intervals: `python studies/intervals.py`, a minute.
 
 The table has the coverage of 95 % intervals in 1000 simulated data sets, for the intervals of
-`eitbench.bench.statistics` and for plain percentile intervals.
+`eitbench.bench.statistics`, for plain percentile intervals, and for Student's t with four numbers.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ from threadpoolctl import threadpool_limits
 
 from eitbench.bench import statistics
 from eitbench.bench.statistics import mean_over_environments, stratified_bootstrap
+from eitbench.bench.text import mean_and_interval
 
 LOG_STD = 0.8
 """Standard deviation of the logarithm of lognormal numbers."""
@@ -32,6 +33,14 @@ def main() -> None:
             adjusted = coverage(draw, truth, n)
             with mock.patch.object(statistics, "tail", lambda sizes: 2.5):
                 print(f"| {name} | {n} | {adjusted:.1f} | {coverage(draw, truth, n):.1f} |")
+        print(f"| {name} | 4 | Student's t: {student_coverage(draw, truth, 4):.1f} | |")
+
+
+def student_coverage(draw: Callable[..., np.ndarray], truth: float, n: int) -> float:
+    """Return the coverage in % of the intervals in tables of `eitbench run` for n numbers."""
+    random = np.random.default_rng(0)
+    intervals = [mean_and_interval(list(draw(random, n))) for _ in range(1000)]
+    return sum(abs(mean - truth) <= half for mean, half in intervals) / 10
 
 
 def coverage(draw: Callable[..., np.ndarray], truth: float, n: int) -> float:

@@ -9,6 +9,7 @@ import numpy as np
 from scipy.stats import t as student
 
 from eitbench.bench.scores import scores
+from eitbench.bench.tracks import is_measured
 from eitbench.data.seeds import seed_ranges as seed_ranges  # for users of this module too
 
 
@@ -54,6 +55,26 @@ def scores_by_seed(record: dict[str, Any], name: str) -> dict[str, float]:
     known = scores()
     factor = known[name].factor if name in known else 1.0
     return {seed: value * factor for seed, value in values.items() if value is not None}
+
+
+def describe_scores(record: dict[str, Any]) -> str:
+    """Return the number of episodes and the mean of each score of a record on one line."""
+    episodes = record["episodes"]
+    failed = sum(episode["status"] != "ok" for episode in episodes)
+    parts = [f"{len(episodes)} episodes" + (f", {failed} failed" if failed else "")]
+    measured = is_measured(record["environment"]["id"])
+    for name, score in scores("measured" if measured else None).items():
+        if measured and name == "error":                # the square of the withheld RMSE
+            continue
+        if values := list(scores_by_seed(record, name).values()):
+            parts.append(f"{score.heading} {format_mean(*mean_and_interval(values))}")
+    return ", ".join(parts)
+
+
+def episodes_worse_than_homogeneous(record: dict[str, Any]) -> str:
+    """Return the seeds of the episodes whose error is larger than the homogeneous estimate's."""
+    return seed_ranges([seed for seed, contrast in
+                        scores_by_seed(record, "contrast_error").items() if contrast > 1.0])
 
 
 def format_number(value: float) -> str:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from pathlib import Path
 from typing import Annotated
 
@@ -103,6 +102,7 @@ def submit(
     from eitbench.bench.records import read_record
     from eitbench.bench.store import EpisodeStore
     from eitbench.bench.submit import submit
+    from eitbench.bench.text import describe_scores, episodes_worse_than_homogeneous
     with options.cli_errors():
         if baseline and policy:
             raise ValueError("one of --baseline and --policy may be given, got both")
@@ -110,10 +110,11 @@ def submit(
         for path in submit(baseline or policy, env or [], seeds_asked, EpisodeStore(out), to,
                            policy=policy is not None, official=official, isolate=isolate,
                            n_jobs=jobs, backend=backend, command=command_line()):
-            episodes = read_record(path)["episodes"]
-            failed = sum(episode["status"] != "ok" for episode in episodes)
-            options.echo(f"wrote {path}: {len(episodes)} episodes"
-                        + (f", {failed} failed" if failed else ""))
+            record = read_record(path)
+            options.echo(f"wrote {path}: {describe_scores(record)}")
+            if worse := episodes_worse_than_homogeneous(record):
+                options.echo(f"warning: ẽ_c is larger than for the homogeneous estimate in {worse}; "
+                             "the method may have diverged", err=True)
 
 
 app.command()(verify)
@@ -207,7 +208,7 @@ def compare(
                          if not env or record["environment"]["id"] in env] for name in (a, b))
         table = comparison.compare(ours, theirs, score, comparison.naive_baseline_records(records))
     names = comparison.display_names(ours[0], theirs[0])
-    width = shutil.get_terminal_size().columns
+    width = options.table_width()
     options.echo(comparison.format_comparison(table, *names, score, width))
 
 

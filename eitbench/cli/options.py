@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import os
+import shutil
 import sys
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
@@ -27,6 +28,12 @@ Isolation = StrEnum("Isolation", ["auto", "none", "process", "bubblewrap"])
 def resolve_path(path: Path | None) -> Path | None:
     """Return the file or folder of an option; see `resolve_input`."""
     return path and resolve_input(path)
+
+
+def table_width() -> int:
+    """Return the width of tables in characters: of the terminal, or unlimited in a file or pipe."""
+    limited = sys.stdout.isatty() or "COLUMNS" in os.environ
+    return shutil.get_terminal_size().columns if limited else sys.maxsize
 
 
 def import_env(env: str | list[str] | None) -> str | list[str] | None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shlex
-import shutil
 import sys
 from collections.abc import Sequence
 from enum import StrEnum
@@ -119,7 +118,7 @@ def print_report(out: Path, asked: Sequence[Job] = (), worlds: Sequence[dict[str
     told = select_requested(store.records(before), asked) if asked else records
     number = swept_parameter(worlds)
     found = sweeps(told, number) if number else []
-    width = shutil.get_terminal_size().columns
+    width = options.table_width()
     options.echo("\n\n".join(each.text(width) for each in found) if found
                 else terminal_tables(run_leaderboards(told, known), width))
     for name in dict.fromkeys(job.environment.name for job in asked):

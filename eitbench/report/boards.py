@@ -110,6 +110,11 @@ class MethodRow(NamedTuple):
         return tuple(filter(None, self.cells["note"].split(", ")))
 
     @property
+    def is_builtin(self) -> bool:
+        """True for a built-in method, whose versions are numbered; false for a user's file."""
+        return version_number(self.cells["version"]) is not None
+
+    @property
     def has_no_rank(self) -> bool:
         """True for a naive baseline, an oracle or a privileged method."""
         return not {"floor", "reference", "privileged"}.isdisjoint(self.badges)

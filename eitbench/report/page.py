@@ -59,11 +59,12 @@ def write_page(store: EpisodeStore, boards: Sequence[Leaderboard],
 
 
 def _snapshots(store: EpisodeStore, board: Leaderboard) -> dict[str, Any] | None:
-    """Return truth and estimates of the best methods, without naive baselines, in one episode, as
-    PNG data; None if their estimates are missing or do not fit the states."""
+    """Return truth and estimates in one episode, of the user's methods first and then of the best,
+    without naive baselines, as PNG data; None if estimates are missing or do not fit the states."""
     chosen = [(row, {episode["seed"] for episode in row.record["episodes"]
                      if episode["status"] == "ok"})
-              for row in board.rows if row.record and "floor" not in row.badges]
+              for row in sorted(board.rows, key=lambda row: row.is_builtin)
+              if row.record and "floor" not in row.badges]
     chosen = [(row, seeds) for row, seeds in chosen if seeds][:N_SNAPSHOT_METHODS]
     shared = sorted(set.intersection(*(seeds for _, seeds in chosen))) if chosen else []
     if not shared:

@@ -386,13 +386,13 @@ def curve_chart(board: Leaderboard) -> charts.Chart | None:
 
 
 def _highlighted_rows(rows: list[MethodRow]) -> list[MethodRow]:
-    """Return the rows with highlighted curves: all, or two unranked rows and the best others, one
-    row for each agent."""
+    """Return the rows with highlighted curves: all, or two unranked rows, the user's methods and the
+    best others, one row for each agent."""
     if len(rows) <= MAX_CURVES:
         return rows
     chosen = [row for row in rows if row.has_no_rank][:2]
     kinds: dict[str, MethodRow] = {}
-    for row in rows:
+    for row in sorted(rows, key=lambda row: row.is_builtin):
         if not row.has_no_rank:
             kinds.setdefault(agent_name(row.cells["method"]), row)
     return chosen + list(kinds.values())[:N_HIGHLIGHTED - len(chosen)]

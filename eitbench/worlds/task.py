@@ -19,51 +19,79 @@ if TYPE_CHECKING:
 
 
 class Estimate(NamedTuple):
-    """Estimate of one state."""
+    """Estimate of one state, with n nodes, L electrodes and k flow parameters.
+
+    Attributes
+    ----------
+    mean : (n,) array
+        Concentration at the nodes of `Task.mesh`, mol/m³.
+    variance : (n,) array, optional
+        Error variance, (mol/m³)²; without it the calibration is not scored.
+    innovation : (L,) array, optional
+        Measured minus predicted voltages before the update, V; for the score NIS/m.
+    innovation_covariance : (L, L) array, optional
+        Covariance of the innovation, V².
+    velocity : (k,) array, optional
+        Parameters of the flow for `Task.velocity`, m/s; by default the prior mean.
+    velocity_variance : (k,) array, optional
+        Error variance of ``velocity``, m²/s².
+    """
 
     mean: np.ndarray
-    """(n,) concentration at the nodes of `Task.mesh`, mol/m³."""
     variance: np.ndarray | None = None
-    """(n,) error variance, (mol/m³)²; None: calibration is not scored."""
     innovation: np.ndarray | None = None
-    """(L,) measured minus predicted voltages, V, before the update; for NIS."""
     innovation_covariance: np.ndarray | None = None
-    """(L, L) covariance of the innovation, V²."""
     velocity: np.ndarray | None = None
-    """(k,) parameters of the flow in m/s for `Task.velocity`; None: the prior mean."""
     velocity_variance: np.ndarray | None = None
-    """(k,) error variance of ``velocity``, m²/s²."""
 
 
 @dataclass(frozen=True, eq=False)
 class Task:
-    """Specification of an estimation problem."""
+    """Specification of an estimation problem; it does not contain the ground truth.
+
+    Attributes
+    ----------
+    transport : Transport
+        Evolution model on ``mesh``, with the nominal flow.
+    observation : ObservationModel
+        Model of the voltages for a concentration on ``mesh``.
+    noise : VoltageNoise
+        Its ``std(voltages)`` is the standard deviation of each measurement, V.
+    currents : (K, L) array
+        Injection cycle, A (A/m in 2D).
+    n_steps : int
+        Measurement vectors of an episode, t = 1 … n_steps.
+    warm_up : int
+        States t ≤ ``warm_up`` are not scored.
+    lag : int
+        Measurement t requests the state t − lag: 0 is filtering, n_steps − 1 smoothing.
+    expected_concentration : float
+        Rough expectation in mol/m³, at which the fit of the homogeneous estimate starts.
+    calibration : int
+        First injections, to which the homogeneous estimate is fitted; usually in the warm-up.
+    prior : Prior
+        Prior of the target relative to the best homogeneous estimate (thesis Table 5.1).
+    velocity : VelocityModel, optional
+        Parametrisation of the flow if it is estimated; ``transport`` has its prior mean.
+    vessel : Vessel, optional
+        Sizes and electrodes.
+    world : str
+        Name of the world, by which trained models are found.
+    """
 
     transport: Transport
-    """evolution model, on `mesh`"""
     observation: ObservationModel
-    """model of the voltages for a concentration on `mesh`"""
     noise: VoltageNoise
     currents: np.ndarray = field(repr=False)
-    """(K, L) injection cycle in A (A/m in 2D)"""
     n_steps: int
-    """measurements in an episode, t = 1 … n_steps"""
     warm_up: int
-    """states t ≤ warm_up are not scored"""
     lag: int
-    """measurement t requests the state t − lag: 0 is filtering, n_steps − 1 is smoothing"""
     expected_concentration: float
-    """rough expectation in mol/m³, at which the fit of the homogeneous estimate starts"""
     calibration: int
-    """first injections, to which the homogeneous estimate is fitted; usually in the warm-up"""
     prior: Prior
-    """prior of the target relative to the best homogeneous estimate (thesis Table 5.1)"""
     velocity: VelocityModel | None = None
-    """parametrisation of the flow if it is requested; ``transport`` has the prior mean"""
     vessel: Vessel | None = None
-    """sizes and electrodes"""
     world: str = ""
-    """name of the world, by which trained models are found"""
 
     @property
     def mesh(self) -> Mesh:
