@@ -113,8 +113,8 @@ def submit(
             record = read_record(path)
             options.echo(f"wrote {path}: {describe_scores(record)}")
             if worse := episodes_worse_than_homogeneous(record):
-                options.echo(f"warning: ẽ_c is larger than for the homogeneous estimate in {worse}; "
-                             "the method may have diverged", err=True)
+                options.echo("warning: ẽ_c is larger than for the homogeneous estimate in "
+                             f"{worse}; the method may have diverged", err=True)
 
 
 app.command()(verify)

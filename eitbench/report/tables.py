@@ -386,8 +386,8 @@ def curve_chart(board: Leaderboard) -> charts.Chart | None:
 
 
 def _highlighted_rows(rows: list[MethodRow]) -> list[MethodRow]:
-    """Return the rows with highlighted curves: all, or two unranked rows, the user's methods and the
-    best others, one row for each agent."""
+    """Return the rows with highlighted curves: all, or two unranked rows, the user's methods and
+    the best others, one row for each agent."""
     if len(rows) <= MAX_CURVES:
         return rows
     chosen = [row for row in rows if row.has_no_rank][:2]

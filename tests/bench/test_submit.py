@@ -205,7 +205,8 @@ def test_from_a_file_to_the_leaderboards_by_command(tmp_path):
     code, said, complaint = eitbench("submit", "--baseline", "mine.py", *common)
     assert "warning: ẽ_c is larger than for the homogeneous estimate in test:0-6" in complaint
     assert code == 0 and re.fullmatch(
-        r"wrote leaderboards/results/eitbench-Pipe2D-v0--mine--\w{8}\.json: 7 episodes, ẽ_c 0\.\d+ ± .*, ms/step .*\n", said)
+        r"wrote leaderboards/results/eitbench-Pipe2D-v0--mine--\w{8}\.json: 7 episodes, ẽ_c 0\.\d+ ± .*, ms/step .*\n",
+        said)
     assert eitbench("submit", "--baseline", "homogeneous", *common)[0] == 0
     assert eitbench("submit", "--policy", "random_pair", "--env", INJECTION, "--seeds", "test:0", "-j", "1")[0] == 0
     code, said, _ = eitbench("leaderboard", "--records", "leaderboards/results")
