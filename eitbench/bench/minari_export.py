@@ -17,10 +17,13 @@ from eitbench.data.dataset import resolve_seeds
 from eitbench.data.export import WARNING
 from eitbench.data.presimulation import presimulate
 from eitbench.data.seeds import allow_test_seeds, format_seed, is_test, seed_ranges
+from eitbench.worlds.registry import published_returns
 
 if TYPE_CHECKING:
     from minari.data_collector import EpisodeBuffer
 
+N_EPISODES = 32
+"""Number of episodes of a published return."""
 DESCRIPTION = """\
 {env}: process tomography in which an agent chooses every injection. Policy {policy}: {title}. \
 Episodes {seeds}; the metadata of an episode holds its seed, with which the actions reproduce \
@@ -57,9 +60,13 @@ def export_minari(name: str, env: str, policy: str, seeds: str | Sequence[int], 
     presimulate(inner.world, numbers, n_jobs=n_jobs, backend=backend)
     episodes = [_run(made, method, seed, k) for k, seed in enumerate(
         tqdm(numbers, desc="running", unit="episode", disable=None))]
+    returns = {row["group"]: float(row["mean"]) for row in published_returns(env)}
     # the id: the spec of an environment that was made has an episode limit, which would truncate
-    create_dataset_from_buffers(name, episodes, env=env, algorithm_name=method.name,
-                                author="eitbench", requirements=["eitbench"],
+    create_dataset_from_buffers(name, episodes, env=env, eval_env=env, algorithm_name=method.name,
+                                author="The eitbench authors", requirements=["eitbench"],
+                                ref_min_score=returns.get("random"),
+                                ref_max_score=max(returns.values(), default=None),
+                                num_episodes_average_score=N_EPISODES,
                                 description=_description(env, method, numbers))
     return len(episodes)
 

@@ -1,4 +1,5 @@
-"""Export of examples to files that do not need this package: one per episode, and a README."""
+"""Export of examples to files that do not need this package: one per episode, a README with the
+header of a Hugging Face data card, and Croissant metadata."""
 
 from __future__ import annotations
 
@@ -14,6 +15,7 @@ from tqdm import tqdm
 from eitbench._extras import require_extra
 from eitbench._files import PACKAGE, write_atomically
 from eitbench.data.cache import config_dict, world_digest
+from eitbench.data.croissant import croissant
 from eitbench.data.dataset import Dataset
 from eitbench.data.episode_cache import CSR_ARRAYS
 from eitbench.data.presimulation import presimulate
@@ -23,15 +25,24 @@ SUFFIXES = {"npz": "npz", "hdf5": "h5"}
 """Format -> suffix of its files."""
 MESH = "mesh.npz"
 INTEGRAL = "(mol/m³)²·m² (m³ in 3D)"
-UNITS = {"seed": "", "voltages": "V", "currents": "A (A/m in 2D)", "truth": "mol/m³",
-         "unresolved": INTEGRAL, "square": INTEGRAL, "velocity": "m/s"}
-"""Unit of each field."""
+FIELDS = {
+    "seed": ("", "", "episode seed"),
+    "voltages": ("({steps}, {electrodes})", "V", "noisy measurements, one vector a time step"),
+    "currents": ("({steps}, {electrodes})", "A (A/m in 2D)", "injected currents"),
+    "truth": ("({steps}, {nodes})", "mol/m³", "concentration at the nodes of `mesh.npz`: "
+              "projection p_t of the true concentration c_t on a finer mesh"),
+    "unresolved": ("({steps},)", INTEGRAL, "∫(p_t − c_t)²"),
+    "square": ("({steps},)", INTEGRAL, "∫c_t²"),
+    "velocity": ("({steps}, {velocity})", "m/s",
+                 "parameters of the best fit to the true flow; empty if the flow is specified")}
+"""Shape, unit and meaning of the arrays of an episode."""
 WARNING = "Test episodes are included: use them to report scores, not for training or selection."
 
 
 def export(examples: Dataset, folder: Path, format: str = "npz", *, n_jobs: int = 1,
            backend: str = "loky") -> int:
-    """Write a file for each example, the mesh and a README; return the number of new examples.
+    """Write a file for each example, the mesh, a README and Croissant metadata; return the number
+    of new examples.
 
     The same call resumes after an interruption, and other seeds may be added.
 
@@ -69,10 +80,15 @@ def export(examples: Dataset, folder: Path, format: str = "npz", *, n_jobs: int 
     held = [path.stem.replace("-", ":") for path in folder.glob(f"[!.]*.{suffix}")
             if path.name != MESH]
     tests = any(is_test(parse_seeds(name)[0]) for name in held)
+    fields = {name: (shape.format(**about), unit, meaning)
+              for name, (shape, unit, meaning) in FIELDS.items()}
     readme = (PACKAGE / "data" / "export_readme.md").read_text(encoding="utf-8").format(
         held=seed_ranges(held), warning=WARNING if tests else "", ms=1e3 * about["time_step"],
-        numbers=json.dumps(about["world"], indent=1), units=UNITS, **about)
+        numbers=json.dumps(about["world"], indent=1), **about,
+        table="\n".join(f"| `{name}` | {' | '.join(texts)} |" for name, texts in fields.items()))
     write_atomically(folder / "README.md", readme.encode())
+    files = [folder / "dataset.json", folder / MESH, *folder.glob(f"[!.]*-*.{suffix}")]
+    write_atomically(folder / "croissant.json", croissant(about, files, fields))
     return len(missing)
 
 
@@ -112,5 +128,5 @@ def _hdf5(arrays: Mapping[str, Any]) -> bytes:
     content = io.BytesIO()
     with h5py.File(content, "w") as file:
         for name, array in arrays.items():
-            file.create_dataset(name, data=array).attrs["units"] = UNITS[name]
+            file.create_dataset(name, data=array).attrs["units"] = FIELDS[name][1]
     return content.getvalue()

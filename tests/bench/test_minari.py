@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 from eitbench.bench.minari_export import export_minari
 from eitbench.cli.app import app
+from eitbench.worlds.registry import published_returns
 from typer.testing import CliRunner
 
 from short import SHORT, shorten
@@ -26,6 +27,9 @@ def test_replaying_gives_the_same_again():
     assert export_minari(NAME, ENV, "random_pair", "train:0-2") == 3
     dataset = minari.load_dataset(NAME)
     env = dataset.recover_environment()
+    low, *_, high = sorted(float(row["mean"]) for row in published_returns(ENV))
+    np.testing.assert_allclose(minari.get_normalized_score(dataset, np.array([low, high])), [0.0, 1.0])
+    assert dataset.recover_environment(eval_env=True).spec.id == ENV
     told = list(dataset.storage.get_episode_metadata(range(3)))
     actions = set()
     for episode, metadata in zip(dataset.iterate_episodes(), told, strict=True):

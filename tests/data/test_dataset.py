@@ -1,5 +1,6 @@
 """Training examples: they equal observations and scores of environments, also in exported files."""
 
+import hashlib
 import pickle
 import re
 import sys
@@ -7,9 +8,11 @@ import sys
 import eitbench
 import gymnasium as gym
 import h5py
+import mlcroissant
 import numpy as np
 import pytest
 import torch
+import yaml
 from eitbench.data import presimulation
 from eitbench.data.episode_cache import cached_episode, integrals, region_operators, score_mass, step_error
 from eitbench.data.episodes import simulate
@@ -197,7 +200,16 @@ def test_files_hold_the_same_and_more_can_be_added(tiny, tmp_path, format, suffi
     if format == "hdf5":
         with h5py.File(folder / "train-0.h5") as file:
             assert file["truth"].attrs["units"] == "mol/m³"
-    assert ": train:0-1." in (folder / "README.md").read_text()
+    readme = (folder / "README.md").read_text()
+    header = yaml.safe_load(readme.split("---")[1])                        # of a Hugging Face data card
+    assert ": train:0-1." in readme and header["license"] == "mit" and header["pretty_name"] == PIPE
+    metadata = mlcroissant.Dataset(jsonld=str(folder / "croissant.json"))
+    assert not metadata.metadata.issues.errors and not metadata.metadata.issues.warnings
+    files = {each.name: each.sha256 for each in metadata.metadata.distribution}
+    assert files == {path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in folder.iterdir()
+                     if path.suffix != ".md" and path.name != "croissant.json"}
+    assert {row["arrays/name"] for row in metadata.records("arrays")} == set(first[0]._fields)
+    assert metadata.metadata.data_limitations and metadata.metadata.personal_sensitive_information
 
 
 def test_the_score_in_the_readme_equals_errors(tiny, tmp_path, monkeypatch):
