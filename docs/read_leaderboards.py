@@ -9,7 +9,7 @@ import sys
 
 from eitbench.bench import load
 
-# One row for each score of each episode; of earlier versions of our methods, none.
+# One row for each score of each episode, without superseded versions of built-in methods.
 frame = load(*sys.argv[1:])
 frame = frame[~frame["outdated"]]
 print(f"{len(frame)} scores of {frame['method'].nunique()} methods in "
