@@ -194,7 +194,8 @@ def leaderboard(
 @app.command()
 def compare(
     a: Annotated[str, typer.Argument(
-        help="File of a record, or METHOD or METHOD@VERSION among the records.")],
+        help="File of a record, or METHOD or METHOD@VERSION among the records; the name of an "
+             "agent without its training seed means the mean over its trainings.")],
     b: Annotated[str, typer.Argument(help="The method to compare with, as for A.")],
     records: options.Records = options.RECORDS,
     env: options.Environments = None,

@@ -186,6 +186,7 @@ def fit_model(
     from tqdm import tqdm
 
     import eitbench
+    from eitbench.bench.text import format_number
     from eitbench.estimation import identify_model
     with options.cli_errors():
         examples = eitbench.dataset(env, seeds)
@@ -199,4 +200,4 @@ def fit_model(
     left = float(model.residual_covariance.trace() / examples.mass.sum())
     options.echo(f"{out}: {modes} modes of the concentration, impulse response of "
                 f"{model.impulse_response.shape[1]} steps; root mean square residual "
-                f"{100 * left**0.5:.2g} %")
+                f"{format_number(100 * left**0.5)} %")

@@ -113,7 +113,8 @@ def cli_errors() -> Iterator[None]:
         echo(sentence, err=True)
         raise typer.Exit(1) from error
     except ValueError as error:
-        raise typer.BadParameter(sanitize(str(error), lines=True)) from error
+        echo(f"error: {error}", err=True)    # not in a box, which would break paths
+        raise typer.Exit(2) from error
 
 
 def report_differences(sentences: Iterable[str]) -> None:

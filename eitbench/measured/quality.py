@@ -37,6 +37,12 @@ SPIKE_CHUNK = 1000
 N_NAMED_SPIKES = 3
 
 
+def percent(fraction: float) -> str:
+    """Format a fraction with two significant digits, at least all before the point: ``0.13 %``,
+    ``130 %``."""
+    return f"{100 * fraction:.2g} %" if fraction < 0.995 else f"{100 * fraction:.0f} %"
+
+
 def find_spikes(measurements: Measurements) -> np.ndarray:
     """Return (T, M) bool: single voltages that differ by far from the same channel's voltages in
     the uses of the injection before and after."""
@@ -117,7 +123,7 @@ def _reciprocity_warnings(measurements: Measurements, calibration: Calibration) 
     change = float(np.sqrt(np.mean(difference[finite]**2)) / scale)
     if change <= RECIPROCITY_TOLERANCE:
         return []
-    return [f"Exchanging injection and measurement changes voltages by {100 * change:.2g} %, which "
+    return [f"Exchanging injection and measurement changes voltages by {percent(change)}, which "
             "breaks reciprocity: the order of injections or of measurements is wrong, or channels "
             "have different gains (then --correction gain helps)."]
 
@@ -157,10 +163,10 @@ def _order_warnings(measurements: Measurements, calibration: Calibration,
     best = int(np.argmin(misfits))
     if misfits[best] <= REORDER_IMPROVEMENT * described:
         return [f"{orders[best][0]}: this reduces the misfit of the homogeneous model from "
-                f"{100 * described:.2g} % to {100 * misfits[best]:.2g} %."]
+                f"{percent(described)} to {percent(misfits[best])}."]
     if calibration.correction == "gain":
         return []
-    return [f"The homogeneous model has a misfit of {100 * described:.2g} % of the voltages: the "
+    return [f"The homogeneous model has a misfit of {percent(described)} of the voltages: the "
             "vessel, the order of the electrodes or the units differ from the description."]
 
 
@@ -171,6 +177,6 @@ def _electrode_warnings(measurements: Measurements, calibration: Calibration) ->
     misfit /= np.sqrt(np.nanmean(calibration.mean_voltages**2))
     median = float(np.median(misfit))
     return [f"Electrode {worst + 1} looks dead or loose: the misfit of its measurements is "
-            f"{100 * misfit[worst]:.2g} % of the RMS voltage, the median of all electrodes "
-            f"{100 * median:.2g} %."
+            f"{percent(misfit[worst])} of the RMS voltage, the median of all electrodes "
+            f"{percent(median)}."
             for worst in np.flatnonzero((misfit > BAD_ELECTRODE_RATIO * median) & (misfit > 0.1))]

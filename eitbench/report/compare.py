@@ -30,6 +30,7 @@ from eitbench.bench.table import MISSING, Cell, Table, number_cell
 from eitbench.bench.text import format_interval, scores_by_seed
 from eitbench.bench.tracks import CATEGORIES, qualified_name
 from eitbench.report.boards import is_naive_baseline, record_category, skill_scores
+from eitbench.report.tables import agent_name
 
 COMPARISON_FIELDS = ("environment", "score", "episodes", "a", "b", "advantage", "low", "high",
           "better", "better_low", "better_high")
@@ -44,7 +45,8 @@ MIN_VERSION_PREFIX = 4
 def find_records(name: str, folder: Path) -> list[dict[str, Any]]:
     """Return the records of a method from the path of one, or from METHOD or METHOD@VERSION within
     a folder, otherwise among the bundled records. Without a version the newest, official ones
-    where there are any; a third-party version may be shortened to four digits.
+    where there are any; a third-party version may be shortened to four digits. The name of an agent
+    without its training seed, such as ppo, is the mean over its trainings.
 
     Raises
     ------
@@ -67,6 +69,11 @@ def find_records(name: str, folder: Path) -> list[dict[str, Any]]:
                if record["method"] == method and (not version or fits(record["version"]))]
         if not version:
             own = [record for record in own if record["official"]] or own
+        if not own and not version:
+            trainings = [record for record in split_outdated(there)[0]
+                         if agent_name(record["method"]) == method]
+            if trainings:
+                return mean_over_trainings(trainings)
         versions = sorted({record["version"] for record in own})
         if len(versions) > 1:
             found = ", ".join(f"{method}@{each}" for each in versions)
@@ -75,6 +82,25 @@ def find_records(name: str, folder: Path) -> list[dict[str, Any]]:
             return own
     raise ValueError(f"record of {name} not found in {folder}"
                      + _check.did_you_mean(method, known))
+
+
+def mean_over_trainings(records: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Return a record of each environment and split with the mean of each score over the trainings
+    of an agent, in the episodes that all of them finished."""
+    groups: dict[tuple[str, str], list[dict[str, Any]]] = {}
+    for record in records:
+        groups.setdefault(_environment_and_split(record), []).append(record)
+    means = []
+    for first, *others in groups.values():
+        tables = [pd.DataFrame({episode["seed"]: episode["scores"] for episode in each["episodes"]
+                                if episode["status"] == "ok"}).astype(float)
+                  for each in (first, *others)]
+        mean = sum(tables[1:], tables[0]) / len(tables)             # NaN where one has no value
+        episodes = [{"seed": seed, "status": "ok", "scores": column.dropna().to_dict()}
+                    for seed, column in mean.items()]
+        means.append(first | {"method": agent_name(first["method"]), "episodes": episodes,
+                              "version": f"mean of {len(tables)} trainings"})
+    return means
 
 
 def resolve_score(name: str) -> Score:

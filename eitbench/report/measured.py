@@ -20,6 +20,7 @@ from eitbench._files import write_atomically
 from eitbench.bench.measured import N_PLOTTED_FRAMES
 from eitbench.envs.rendering import draw_electrodes, draw_field
 from eitbench.measured.calibration import electrode_misfits
+from eitbench.measured.quality import percent
 from eitbench.measured.segmentation import ktc_score, require_round_tank, segment
 from eitbench.physics.stationary import StationaryTransport
 from eitbench.report.templates import data_uri, render_template
@@ -74,7 +75,7 @@ def _facts(env: MeasuredEnv) -> dict[str, str]:
         "measurements": f"{len(measurements.injection_index)} times {len(measurements.matrix)}, of "
                     f"{len(measurements.currents)} different injections",
         "conductivity": f"{calibration.conductivity:.4g} S/m ± "
-                        f"{100 * calibration.conductivity_std:.2g} %",
+                        f"{percent(calibration.conductivity_std)}",
         "channel gain": f"{calibration.gain:.4g}",
         "contact impedances": f"{contacts.min():.3g} to {contacts.max():.3g} mΩ·m²",
         "noise of the instrument" if calibration.noise_from_repeats else "misfit of the model":
@@ -84,16 +85,16 @@ def _facts(env: MeasuredEnv) -> dict[str, str]:
     if flow is not None and not _is_at_rest(env):
         spread = f"± {flow.velocity_std:.2g} m/s" if flow.is_estimated else "known"
         return facts | {"flow": f"{flow.mean_velocity:.3g} m/s on average, {spread}"}
-    facts["initial state"] = (f"± {100 * task.prior.initial_std:.3g} % of the background, smooth "
+    facts["initial state"] = (f"± {percent(task.prior.initial_std)} of the background, smooth "
                               f"over {100 * task.prior.initial_length:.2g} cm")
     if not _is_at_rest(env):
-        facts["random walk"] = (f"± {100 * task.prior.nodal_std:.2g} % of the background in a step "
+        facts["random walk"] = (f"± {percent(task.prior.nodal_std)} of the background in a step "
                                 f"of {1e3 * task.transport.time_step:.3g} ms")
     return facts
 
 
 def _noise(noise: Any) -> str:
-    return f"{100 * noise.relative:.2g} % of the measurement and {1e3 * noise.floor:.2g} mV"
+    return f"{percent(noise.relative)} of the measurement and {1e3 * noise.floor:.2g} mV"
 
 
 def _estimate(env: MeasuredEnv, run: MeasuredRun) -> str:

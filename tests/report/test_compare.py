@@ -63,6 +63,17 @@ def test_numbers_are_those_of_the_statistics():
     np.testing.assert_allclose(swapped["better"], 1 - table["better"])
 
 
+def test_an_agent_is_the_mean_of_its_trainings(tmp_path):
+    """Without a training seed the name of an agent means the average, in episodes that every training finished."""
+    errors = np.random.default_rng(0).uniform(0.1, 0.2, (3, 8))
+    for name, row in zip(("ppo_seed0", "ppo_seed1", "other"), errors, strict=True):
+        write_record(tmp_path, record(name, row[:7 if name == "ppo_seed1" else 8].tolist(), id=TANK))
+    table = compare(find_records("ppo", tmp_path), find_records("other", tmp_path))
+    assert table["a"].item() == pytest.approx(errors[:2, :7].mean()) and table["episodes"].item() == 7
+    (mean,) = find_records("ppo", tmp_path)
+    assert (mean["method"], mean["version"]) == ("ppo", "mean of 2 trainings")
+
+
 def test_over_environments_gains_are_compared():
     """a halves the error of the pipe and is slightly worse in the tank, with errors a hundred times larger: by
     skill scores it is better, as on the leaderboards. Without naive baselines the aggregate is empty."""
