@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from eitbench.estimation.estimators import Measurement
-from eitbench.estimation.identified import FINGERPRINT_ATOL, task_fingerprint
+from eitbench.estimation.identified import has_fingerprint
 from eitbench.estimation.inflow_window import inflow_filter
 from eitbench.worlds.task import Estimate
 
@@ -39,11 +39,8 @@ def network_matches_task(path: Path, task: Task) -> bool:
     if not path.is_file():
         return False
     known = load_network(path)
-    if task.velocity is not None or task.mesh.n_nodes != len(known["basis"]):
-        return False
-    fingerprint = task_fingerprint(task)
-    return fingerprint.shape == known["task"].shape and np.allclose(
-        fingerprint, known["task"], atol=FINGERPRINT_ATOL)
+    return (task.velocity is None and task.mesh.n_nodes == len(known["basis"])
+            and has_fingerprint(task, known["task"]))
 
 
 # -- the network -----------------------------------------------------------------------------------
@@ -105,11 +102,8 @@ class FilterFeatures:
 
     Parameters
     ----------
-    task : Task
-    prior : InflowPrior
-        Prior for the task's inlet.
-    c_ref : float
-        ĉ_bh in mol/m³.
+    task, prior, c_ref
+        As in `InflowWindow`.
     basis : (n, q)
         Modes of c/ĉ_bh − 1.
     lag : int
