@@ -6,9 +6,7 @@ The inflow's logarithm has a coloured Gaussian prior, also fitted to training ep
 
 from pathlib import Path
 
-import numpy as np
-
-from eitbench import Estimate, Task
+from eitbench import Task
 from eitbench.estimation import FilterEstimator, compatible_models, compatible_priors, inflow_filter
 
 BASELINE_DIR = Path(__file__).parent
@@ -16,19 +14,16 @@ LINK = "logarithm"
 MODELS = BASELINE_DIR / "models" / "linearised"
 
 
-class Estimator:
+class Estimator(FilterEstimator):
     subtracks = ("filter", "fixed-lag")
 
     def __init__(self, task: Task) -> None:
         prior = compatible_priors(BASELINE_DIR / "priors", task, LINK)[0]
         model = compatible_models(MODELS, task)[0]
-        self.estimator = FilterEstimator(
+        super().__init__(
             task, lambda c_ref: inflow_filter(task, prior, c_ref, task.lag, model=model))
 
     @staticmethod
     def suits(task: Task) -> bool:
         known_inlet = bool(compatible_priors(BASELINE_DIR / "priors", task, LINK))
         return task.velocity is None and known_inlet and bool(compatible_models(MODELS, task))
-
-    def update(self, voltages: np.ndarray, currents: np.ndarray) -> Estimate | None:
-        return self.estimator.update(voltages, currents)

@@ -8,14 +8,12 @@ have two regimes. For stationary targets, the state is the logarithm of the conc
 
 from pathlib import Path
 
-import numpy as np
-
-from eitbench import Estimate, Task
+from eitbench import Task
 from eitbench.estimation import (
     Filter,
     FilterEstimator,
     LogStates,
-    SmootherEstimator,
+    RecordSmoother,
     SwitchingInflowFilter,
     VelocityInflowWindow,
     compatible_models,
@@ -44,7 +42,7 @@ LEVEL_STD = 0.05
 """Standard deviation of the inflow between rare slugs, relative to the homogeneous estimate."""
 
 
-class Estimator:
+class Estimator(FilterEstimator):
     subtracks = ("filter", "fixed-lag", "smoothing")
     parameters = {  # noqa: RUF012 (as a record has it)
         "bounds": list(BOUNDS), "window": WINDOW, "factor_std": VELOCITY_FACTOR_STD,
@@ -55,21 +53,13 @@ class Estimator:
         models = [model for model in compatible_models(BASELINE_DIR / "models", task)
                   if source_world(model.source) in nominal_worlds(task.world)]
         model = models[0] if models else None
-        self.estimator: FilterEstimator | SmootherEstimator
-        if prior is not None and task.velocity is None and task.lag == task.n_steps - 1:
-            self.estimator = SmootherEstimator(task, lambda c_ref, record: map_inflow(
-                task, prior, c_ref, record, model=model))
-        else:
-            self.estimator = FilterEstimator(task, lambda c_ref: choose(task, c_ref, prior, model))
+        super().__init__(task, lambda c_ref: choose(task, c_ref, prior, model))
 
     @staticmethod
     def suits(task: Task) -> bool:
         """Return True for the filtering subtrack, and for tasks with an inflow prior."""
         return not task.lag or (task.velocity is None and bool(
             compatible_priors(BASELINE_DIR / "priors", task, "logarithm")))
-
-    def update(self, voltages: np.ndarray, currents: np.ndarray) -> Estimate | None:
-        return self.estimator.update(voltages, currents)
 
 
 def choose(task: Task, c_ref: float, prior, model):
@@ -85,6 +75,8 @@ def choose(task: Task, c_ref: float, prior, model):
     if task.velocity is not None:
         flow = task_velocity_prior(task, BOUNDS)
         return Filter(VelocityInflowWindow(task, prior, c_ref, flow, WINDOW), extended)
+    if task.lag == task.n_steps - 1:
+        return RecordSmoother(lambda record: map_inflow(task, prior, c_ref, record, model=model))
     if model is not None:
         return inflow_filter(task, prior, c_ref, task.lag, model=model, iterated=True)
     if prior.regimes is not None and not task.lag:

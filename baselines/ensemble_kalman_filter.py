@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from eitbench import Estimate, Task
+from eitbench import Task
 from eitbench.estimation import (
     EnsembleFilter,
     FilterEstimator,
@@ -30,7 +30,7 @@ SEED = 0
 """Random seed of the ensemble, the same in every episode."""
 
 
-class Estimator:
+class Estimator(FilterEstimator):
     subtracks = ("filter",)
     parameters = {  # noqa: RUF012 (as a record has it)
         "members": MEMBERS, "lead_in": SPIN_UP_STEPS, "bounds": list(BOUNDS), "seed": SEED}
@@ -39,7 +39,7 @@ class Estimator:
         prior = compatible_priors(PRIORS, task, LINK)[0]
         flow = (scaled_velocity_prior(task, 0.0, 0.0) if task.velocity is None
                 else task_velocity_prior(task, BOUNDS))
-        self.estimator = FilterEstimator(task, lambda c_ref: EnsembleFilter(
+        super().__init__(task, lambda c_ref: EnsembleFilter(
             task, prior, c_ref, flow, MEMBERS, SPIN_UP_STEPS, np.random.default_rng(SEED),
             linearise_at_prediction(task)))
 
@@ -47,6 +47,3 @@ class Estimator:
     def suits(task: Task) -> bool:
         # a 3D inlet has too many modes for an ensemble of this size
         return task.mesh.dim == 2 and bool(compatible_priors(PRIORS, task, LINK))
-
-    def update(self, voltages: np.ndarray, currents: np.ndarray) -> Estimate | None:
-        return self.estimator.update(voltages, currents)

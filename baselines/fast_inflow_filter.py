@@ -8,9 +8,7 @@ from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 
-import numpy as np
-
-from eitbench import Estimate, Task
+from eitbench import Task
 from eitbench.estimation import (
     FilterEstimator,
     ScaledVoltageModel,
@@ -28,7 +26,7 @@ N_QUADRATIC_MODES = 48
 """Number of leading modes in which voltages are quadratic."""
 
 
-class Estimator:
+class Estimator(FilterEstimator):
     subtracks = ("filter",)
 
     def __init__(self, task: Task) -> None:
@@ -36,16 +34,12 @@ class Estimator:
         response, fast = reduced(task.transport, task.observation, task.expected_concentration,
                                  prior)
         task = replace(task, observation=fast)
-        self.estimator = FilterEstimator(
+        super().__init__(
             task, lambda c_ref: inflow_filter(task, prior, c_ref, responses=[response]))
 
     @staticmethod
     def suits(task: Task) -> bool:
-        known_flow = task.velocity is None
-        return known_flow and bool(compatible_priors(PRIORS, task, LINK))
-
-    def update(self, voltages: np.ndarray, currents: np.ndarray) -> Estimate | None:
-        return self.estimator.update(voltages, currents)
+        return task.velocity is None and bool(compatible_priors(PRIORS, task, LINK))
 
 
 @lru_cache(maxsize=2)

@@ -17,19 +17,16 @@ VELOCITY_FACTORS = tuple(np.linspace(0.5, 1.5, 9).tolist())
 WINDOW = 16  # injections
 
 
-class Estimator:
+class Estimator(FilterEstimator):
     subtracks = ("filter",)
     parameters = {"factors": list(VELOCITY_FACTORS), "window": WINDOW}  # noqa: RUF012 (as a record has it)
 
     def __init__(self, task: Task) -> None:
-        self.estimator = FilterEstimator(task, lambda c_ref: FilterBank(task, c_ref))
+        super().__init__(task, lambda c_ref: FilterBank(task, c_ref))
 
     @staticmethod
     def suits(task: Task) -> bool:
         return task.velocity is not None
-
-    def update(self, voltages: np.ndarray, currents: np.ndarray) -> Estimate | None:
-        return self.estimator.update(voltages, currents)
 
 
 class FilterBank:

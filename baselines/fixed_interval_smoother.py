@@ -1,31 +1,26 @@
 """Fixed-interval Kalman smoother: the Kalman filter and a backward pass over all measurements
 (thesis 5.1.2)."""
 
-from collections.abc import Sequence
-
-import numpy as np
-
-from eitbench import Estimate, Task
+from eitbench import Task
 from eitbench.estimation import (
+    FilterEstimator,
     LinearisedForwardModel,
-    SmootherEstimator,
+    RecordSmoother,
     fixed_interval_smoother,
     table_5_1_filter,
 )
 
 
-class Estimator:
+class Estimator(FilterEstimator):
     subtracks = ("smoothing",)
 
     def __init__(self, task: Task) -> None:
-        self.task = task
-        self.estimator = SmootherEstimator(task, self.smooth)
+        super().__init__(task, lambda c_ref: start(task, c_ref))
 
-    def update(self, voltages: np.ndarray, currents: np.ndarray) -> Estimate | None:
-        return self.estimator.update(voltages, currents)
 
-    def smooth(self, c_ref: float, record: Sequence[tuple[np.ndarray, np.ndarray]]):
-        task = self.task
-        start = table_5_1_filter(task.transport, task.prior, c_ref)
-        linear = LinearisedForwardModel(task.observation, task.noise, start.mean)
-        return fixed_interval_smoother(start, [linear(*measurement) for measurement in record])
+def start(task: Task, c_ref: float) -> RecordSmoother:
+    """Return the smoother for a best homogeneous estimate in mol/m³."""
+    filter_ = table_5_1_filter(task.transport, task.prior, c_ref)
+    linear = LinearisedForwardModel(task.observation, task.noise, filter_.mean)
+    return RecordSmoother(lambda record: fixed_interval_smoother(
+        filter_, [linear(*measurement) for measurement in record]))

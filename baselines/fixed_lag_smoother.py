@@ -12,14 +12,11 @@ from eitbench.estimation import (
 )
 
 
-class Estimator:
+class Estimator(FilterEstimator):
     subtracks = ("fixed-lag",)
 
     def __init__(self, task: Task) -> None:
-        self.estimator = FilterEstimator(task, lambda c_ref: FixedLagSmoother(task, c_ref))
-
-    def update(self, voltages: np.ndarray, currents: np.ndarray) -> Estimate | None:
-        return self.estimator.update(voltages, currents)
+        super().__init__(task, lambda c_ref: FixedLagSmoother(task, c_ref))
 
 
 class FixedLagSmoother:

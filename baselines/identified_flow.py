@@ -7,12 +7,11 @@ each measurement vector twice. The smoother computes the most probable inflow.
 
 from pathlib import Path
 
-import numpy as np
-
-from eitbench import Estimate, Task
+from eitbench import Task
 from eitbench.estimation import (
+    Filter,
     FilterEstimator,
-    SmootherEstimator,
+    RecordSmoother,
     compatible_models,
     compatible_priors,
     inflow_filter,
@@ -22,25 +21,23 @@ from eitbench.estimation import (
 BASELINE_DIR = Path(__file__).parent
 
 
-class Estimator:
+class Estimator(FilterEstimator):
     subtracks = ("filter", "fixed-lag", "smoothing")
 
     def __init__(self, task: Task) -> None:
         prior = compatible_priors(BASELINE_DIR / "priors", task, "logarithm")[0]
         model = compatible_models(BASELINE_DIR / "models", task)[0]
-        self.estimator: FilterEstimator | SmootherEstimator
-        if task.lag == task.n_steps - 1:
-            self.estimator = SmootherEstimator(task, lambda c_ref, record: map_inflow(
+
+        def start(c_ref: float) -> Filter | RecordSmoother:
+            if task.lag < task.n_steps - 1:
+                return inflow_filter(task, prior, c_ref, task.lag, model=model, iterated=True)
+            return RecordSmoother(lambda record: map_inflow(
                 task, prior, c_ref, record, model=model))
-        else:
-            self.estimator = FilterEstimator(task, lambda c_ref: inflow_filter(
-                task, prior, c_ref, task.lag, model=model, iterated=True))
+
+        super().__init__(task, start)
 
     @staticmethod
     def suits(task: Task) -> bool:
         known_inlet = bool(compatible_priors(BASELINE_DIR / "priors", task, "logarithm"))
         known_flow = bool(compatible_models(BASELINE_DIR / "models", task))
         return task.velocity is None and known_inlet and known_flow
-
-    def update(self, voltages: np.ndarray, currents: np.ndarray) -> Estimate | None:
-        return self.estimator.update(voltages, currents)

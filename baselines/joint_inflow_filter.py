@@ -6,9 +6,7 @@ A velocity that the task specifies is scaled by an unknown factor.
 
 from pathlib import Path
 
-import numpy as np
-
-from eitbench import Estimate, Task
+from eitbench import Task
 from eitbench.estimation import (
     Filter,
     FilterEstimator,
@@ -30,7 +28,7 @@ FACTOR_WALK = 0.0
 """Standard deviations of the initial factor and of its steps."""
 
 
-class Estimator:
+class Estimator(FilterEstimator):
     subtracks = ("filter",)
     parameters = {  # noqa: RUF012 (as a record has it)
         "window": WINDOW, "bounds": list(BOUNDS), "factor_std": VELOCITY_FACTOR_STD,
@@ -40,13 +38,10 @@ class Estimator:
         prior = compatible_priors(PRIORS, task, LINK)[0]
         flow = (scaled_velocity_prior(task, VELOCITY_FACTOR_STD, FACTOR_WALK)
                 if task.velocity is None else task_velocity_prior(task, BOUNDS))
-        self.estimator = FilterEstimator(task, lambda c_ref: Filter(
+        super().__init__(task, lambda c_ref: Filter(
             VelocityInflowWindow(task, prior, c_ref, flow, WINDOW), linearise_at_prediction(task)))
 
     @staticmethod
     def suits(task: Task) -> bool:
         # a 3D inlet has four times the nodes, and all their contributions are propagated
         return task.mesh.dim == 2 and bool(compatible_priors(PRIORS, task, LINK))
-
-    def update(self, voltages: np.ndarray, currents: np.ndarray) -> Estimate | None:
-        return self.estimator.update(voltages, currents)

@@ -9,14 +9,13 @@ needs numpy and the network file, which only a checkout contains.
 
 from pathlib import Path
 
-import numpy as np
-
-from eitbench import Estimate, Task
+from eitbench import Task
 from eitbench.estimation import (
+    FilterEstimator,
     FilterFeatures,
+    NetworkCorrectedFilter,
     compatible_priors,
     load_network,
-    network_estimator,
     network_matches_task,
 )
 
@@ -24,22 +23,18 @@ BASELINE_DIR = Path(__file__).parent
 NETWORK = "networks/pipe2d-biased.npz"
 
 
-class Estimator:
+class Estimator(FilterEstimator):
     subtracks = ("filter",)
     parameters = {"network": NETWORK}  # noqa: RUF012 (as a record has it)
 
     def __init__(self, task: Task) -> None:
         network = load_network(BASELINE_DIR / NETWORK)
         prior = compatible_priors(BASELINE_DIR / "priors", task, "logarithm")[0]
-        self.estimator = network_estimator(
-            task, network,
-            lambda level: FilterFeatures(task, prior, level, network["basis"]))
+        super().__init__(task, lambda c_ref: NetworkCorrectedFilter(
+            network, FilterFeatures(task, prior, c_ref, network["basis"])))
 
     @staticmethod
     def suits(task: Task) -> bool:
         """Return True for tasks with the vessel, injections and flow model of the training."""
         known_inlet = bool(compatible_priors(BASELINE_DIR / "priors", task, "logarithm"))
         return known_inlet and network_matches_task(BASELINE_DIR / NETWORK, task)
-
-    def update(self, voltages: np.ndarray, currents: np.ndarray) -> Estimate | None:
-        return self.estimator.update(voltages, currents)

@@ -9,14 +9,13 @@ shrinks, the filter's estimates are not corrected.
 
 from pathlib import Path
 
-import numpy as np
-
-from eitbench import Estimate, Task
+from eitbench import Task
 from eitbench.estimation import (
+    FilterEstimator,
     FilterFeatures,
+    NetworkCorrectedFilter,
     compatible_priors,
     load_network,
-    network_estimator,
     network_matches_task,
 )
 
@@ -25,16 +24,15 @@ NETWORK = "networks/pipe2d-lag.npz"
 LAG = 4
 
 
-class Estimator:
+class Estimator(FilterEstimator):
     subtracks = ("fixed-lag",)
     parameters = {"network": NETWORK}  # noqa: RUF012 (as a record has it)
 
     def __init__(self, task: Task) -> None:
         network = load_network(BASELINE_DIR / NETWORK)
         prior = compatible_priors(BASELINE_DIR / "priors", task, "logarithm")[0]
-        self.estimator = network_estimator(
-            task, network,
-            lambda level: FilterFeatures(task, prior, level, network["basis"], LAG))
+        super().__init__(task, lambda c_ref: NetworkCorrectedFilter(
+            network, FilterFeatures(task, prior, c_ref, network["basis"], LAG)))
 
     @staticmethod
     def suits(task: Task) -> bool:
@@ -42,6 +40,3 @@ class Estimator:
         known_inlet = bool(compatible_priors(BASELINE_DIR / "priors", task, "logarithm"))
         return (task.lag == LAG and known_inlet
                 and network_matches_task(BASELINE_DIR / NETWORK, task))
-
-    def update(self, voltages: np.ndarray, currents: np.ndarray) -> Estimate | None:
-        return self.estimator.update(voltages, currents)

@@ -7,15 +7,14 @@ trains it; inference needs numpy and the network file, which only a checkout con
 
 from pathlib import Path
 
-import numpy as np
-
-from eitbench import Estimate, Task
+from eitbench import Task
 from eitbench.estimation import (
+    FilterEstimator,
     FilterFeatures,
+    NetworkCorrectedFilter,
     compatible_models,
     compatible_priors,
     load_network,
-    network_estimator,
     network_matches_task,
 )
 
@@ -23,7 +22,7 @@ BASELINE_DIR = Path(__file__).parent
 NETWORK = "networks/pipe2d-obstacle.npz"
 
 
-class Estimator:
+class Estimator(FilterEstimator):
     subtracks = ("filter",)
     parameters = {"network": NETWORK}  # noqa: RUF012 (as a record has it)
 
@@ -31,9 +30,8 @@ class Estimator:
         network = load_network(BASELINE_DIR / NETWORK)
         prior = compatible_priors(BASELINE_DIR / "priors", task, "logarithm")[0]
         model = compatible_models(BASELINE_DIR / "models", task)[0]
-        self.estimator = network_estimator(
-            task, network,
-            lambda level: FilterFeatures(task, prior, level, network["basis"], model=model))
+        super().__init__(task, lambda c_ref: NetworkCorrectedFilter(
+            network, FilterFeatures(task, prior, c_ref, network["basis"], model=model)))
 
     @staticmethod
     def suits(task: Task) -> bool:
@@ -41,6 +39,3 @@ class Estimator:
         known = (compatible_priors(BASELINE_DIR / "priors", task, "logarithm")
                  and compatible_models(BASELINE_DIR / "models", task))
         return bool(known) and network_matches_task(BASELINE_DIR / NETWORK, task)
-
-    def update(self, voltages: np.ndarray, currents: np.ndarray) -> Estimate | None:
-        return self.estimator.update(voltages, currents)

@@ -14,8 +14,9 @@ import numpy as np
 
 from eitbench import Estimate, Task
 from eitbench.estimation import (
+    FilterEstimator,
     FilterFeatures,
-    SmootherEstimator,
+    RecordSmoother,
     apply_correction,
     compatible_priors,
     gru_step,
@@ -30,14 +31,14 @@ LAG = 20
 """Time steps after which measurements hardly change the estimate of a state."""
 
 
-class Estimator:
+class Estimator(FilterEstimator):
     subtracks = ("smoothing",)
     parameters = {"network": NETWORK, "lag": LAG}  # noqa: RUF012 (as a record has it)
 
     def __init__(self, task: Task) -> None:
-        self.task = task
+        super().__init__(task, lambda c_ref: RecordSmoother(
+            lambda record: self.corrected(c_ref, record)))
         self.network = load_network(BASELINE_DIR / NETWORK)
-        self.estimator = SmootherEstimator(task, self.read)
 
     @staticmethod
     def suits(task: Task) -> bool:
@@ -46,10 +47,7 @@ class Estimator:
         long_enough = task.n_steps > LAG
         return long_enough and known_inlet and network_matches_task(BASELINE_DIR / NETWORK, task)
 
-    def update(self, voltages: np.ndarray, currents: np.ndarray) -> Estimate | None:
-        return self.estimator.update(voltages, currents)
-
-    def read(self, c_ref: float, record) -> list[Estimate]:
+    def corrected(self, c_ref: float, record) -> list[Estimate]:
         """Return the corrected states of a whole measurement sequence."""
         prior = compatible_priors(BASELINE_DIR / "priors", self.task, "logarithm")[0]
         see = FilterFeatures(self.task, prior, c_ref, self.network["basis"], LAG)

@@ -8,13 +8,12 @@ inference needs numpy and the network file, which only a checkout contains.
 
 from pathlib import Path
 
-import numpy as np
-
-from eitbench import Estimate, Task
+from eitbench import Task
 from eitbench.estimation import (
+    FilterEstimator,
+    NetworkCorrectedFilter,
     VoltageFeatures,
     load_network,
-    network_estimator,
     network_matches_task,
 )
 
@@ -22,19 +21,16 @@ BASELINE_DIR = Path(__file__).parent
 NETWORK = "networks/pipe2d-voltages.npz"
 
 
-class Estimator:
+class Estimator(FilterEstimator):
     subtracks = ("filter",)
     parameters = {"network": NETWORK}  # noqa: RUF012 (as a record has it)
 
     def __init__(self, task: Task) -> None:
         network = load_network(BASELINE_DIR / NETWORK)
-        self.estimator = network_estimator(
-            task, network, lambda level: VoltageFeatures(task, level, network["basis"]))
+        super().__init__(task, lambda c_ref: NetworkCorrectedFilter(
+            network, VoltageFeatures(task, c_ref, network["basis"])))
 
     @staticmethod
     def suits(task: Task) -> bool:
         """Return True for tasks with the vessel and injections of the training."""
         return network_matches_task(BASELINE_DIR / NETWORK, task)
-
-    def update(self, voltages: np.ndarray, currents: np.ndarray) -> Estimate | None:
-        return self.estimator.update(voltages, currents)

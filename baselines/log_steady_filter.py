@@ -6,9 +6,7 @@ process in time, with the rate that maximises the likelihood of some frames. The
 modes of the smoothness prior and their rates of change.
 """
 
-import numpy as np
-
-from eitbench import Estimate, Task
+from eitbench import Task
 from eitbench.estimation import (
     Filter,
     FilterEstimator,
@@ -20,7 +18,7 @@ from eitbench.estimation.walk import RandomWalk, matern32_transition, matern_mod
 from eitbench.physics.stationary import StationaryTransport
 
 
-class Estimator:
+class Estimator(FilterEstimator):
     subtracks = ("filter",)
 
     def __init__(self, task: Task) -> None:
@@ -29,12 +27,9 @@ class Estimator:
         modes = matern_modes(task.mesh, task.prior.initial_length)
         states = modal_states(modes.shape[1], task.prior.initial_std,
                               lambda time: matern32_transition(rate * transport.time_step))
-        self.estimator = FilterEstimator(task, lambda c_ref: Filter(
+        super().__init__(task, lambda c_ref: Filter(
             LogStates(states, c_ref, modes), linearise_at_prediction(task)))
 
     @staticmethod
     def suits(task: Task) -> bool:
         return isinstance(task.transport, StationaryTransport | RandomWalk)
-
-    def update(self, voltages: np.ndarray, currents: np.ndarray) -> Estimate | None:
-        return self.estimator.update(voltages, currents)

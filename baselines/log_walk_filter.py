@@ -6,9 +6,7 @@ of many times the background: estimates are positive. The logarithm has the init
 walk that `Task.prior` specifies for the concentration relative to the best homogeneous estimate.
 """
 
-import numpy as np
-
-from eitbench import Estimate, Task
+from eitbench import Task
 from eitbench.estimation import (
     Filter,
     FilterEstimator,
@@ -20,17 +18,14 @@ from eitbench.estimation.walk import RandomWalk
 from eitbench.physics.stationary import StationaryTransport
 
 
-class Estimator:
+class Estimator(FilterEstimator):
     subtracks = ("filter",)
 
     def __init__(self, task: Task) -> None:
         states = nodal_states(task.transport, task.prior, 1.0)
-        self.estimator = FilterEstimator(task, lambda c_ref: Filter(
+        super().__init__(task, lambda c_ref: Filter(
             LogStates(states, c_ref), linearise_at_prediction(task)))
 
     @staticmethod
     def suits(task: Task) -> bool:
         return isinstance(task.transport, StationaryTransport | RandomWalk)
-
-    def update(self, voltages: np.ndarray, currents: np.ndarray) -> Estimate | None:
-        return self.estimator.update(voltages, currents)

@@ -6,47 +6,18 @@ For stationary targets, where the linearised filter approximates this estimate (
 
 import numpy as np
 
-from eitbench import Estimate, Task
-from eitbench.estimation import CalibrationFrame, gauss_newton, initial_covariance
+from eitbench import Task
+from eitbench.estimation import FilterEstimator, StationaryMap
 from eitbench.physics.stationary import StationaryTransport
 
 
-class Estimator:
+class Estimator(FilterEstimator):
     subtracks = ("filter",)
 
     def __init__(self, task: Task) -> None:
-        self.task = task
-        self.first = CalibrationFrame(task)
-        self.measurements: list[tuple[np.ndarray, np.ndarray]] = []
+        super().__init__(task, lambda c_ref: StationaryMap(
+            task, c_ref, lambda deviation: (1.0 + deviation, np.ones_like(deviation))))
 
     @staticmethod
     def suits(task: Task) -> bool:
         return isinstance(task.transport, StationaryTransport)
-
-    def update(self, voltages: np.ndarray, currents: np.ndarray) -> Estimate:
-        task = self.task
-        self.measurements.append((voltages, currents))
-        if not self.first.complete:
-            if not self.first.add(voltages, currents):
-                return Estimate(self.first.mean)
-            covariance = self.first.c_ref**2 * initial_covariance(task.mesh, task.prior)
-            self.penalty = np.linalg.inv(covariance)
-            self.deviation = np.zeros(task.mesh.n_nodes)
-        V, I = (np.array(part) for part in zip(*self.measurements, strict=True))
-        model = DeviationModel(task.observation, self.first.mean)
-        self.deviation = gauss_newton(model, V, I, task.noise.std(V), self.penalty, self.deviation)
-        return Estimate(self.first.mean + self.deviation)
-
-
-class DeviationModel:
-    """Voltages as a function of the deviation from the prior mean; `gauss_newton` penalises it."""
-
-    def __init__(self, observation, mean: np.ndarray) -> None:
-        self.observation = observation
-        self.mean = mean
-
-    def voltages(self, deviation: np.ndarray, currents: np.ndarray) -> np.ndarray:
-        return self.observation.voltages(self.mean + deviation, currents)
-
-    def linearise(self, deviation: np.ndarray, currents: np.ndarray):
-        return self.observation.linearise(self.mean + deviation, currents)

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from eitbench import Estimate, Task
+from eitbench import Task
 from eitbench.estimation import (
     FilterEstimator,
     ParticleInflowFilter,
@@ -23,13 +23,13 @@ PARTICLES = 8
 SEED = 0
 
 
-class Estimator:
+class Estimator(FilterEstimator):
     subtracks = ("filter",)
     parameters = {"level_std": LEVEL_STD, "particles": PARTICLES, "seed": SEED}  # noqa: RUF012
 
     def __init__(self, task: Task) -> None:
         prior = compatible_priors(PRIORS, task, LINK)[0]
-        self.estimator = FilterEstimator(task, lambda c_ref: ParticleInflowFilter(
+        super().__init__(task, lambda c_ref: ParticleInflowFilter(
             task, prior, c_ref, LEVEL_STD, linearise_at_prediction(task), PARTICLES,
             np.random.default_rng(SEED)))
 
@@ -37,6 +37,3 @@ class Estimator:
     def suits(task: Task) -> bool:
         priors = compatible_priors(PRIORS, task, LINK)
         return task.velocity is None and bool(priors) and priors[0].regimes is not None
-
-    def update(self, voltages: np.ndarray, currents: np.ndarray) -> Estimate | None:
-        return self.estimator.update(voltages, currents)

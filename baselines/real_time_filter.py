@@ -8,9 +8,7 @@ from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 
-import numpy as np
-
-from eitbench import Estimate, Task
+from eitbench import Task
 from eitbench.estimation import (
     FilterEstimator,
     IdentifiedModel,
@@ -23,14 +21,14 @@ from eitbench.estimation import (
 BASELINE_DIR = Path(__file__).parent
 
 
-class Estimator:
+class Estimator(FilterEstimator):
     subtracks = ("filter",)
 
     def __init__(self, task: Task) -> None:
         prior = compatible_priors(BASELINE_DIR / "priors", task, "logarithm")[0]
         model = compatible_models(BASELINE_DIR / "models", task)[0]
         task = replace(task, observation=quadratic(task.observation, model))
-        self.estimator = FilterEstimator(
+        super().__init__(
             task, lambda c_ref: inflow_filter(task, prior, c_ref, model=model))
 
     @staticmethod
@@ -38,9 +36,6 @@ class Estimator:
         known_inlet = bool(compatible_priors(BASELINE_DIR / "priors", task, "logarithm"))
         known_flow = bool(compatible_models(BASELINE_DIR / "models", task))
         return task.velocity is None and known_inlet and known_flow
-
-    def update(self, voltages: np.ndarray, currents: np.ndarray) -> Estimate | None:
-        return self.estimator.update(voltages, currents)
 
 
 @lru_cache(maxsize=2)

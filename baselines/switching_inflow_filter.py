@@ -4,9 +4,7 @@ slug; the logarithm in slugs has a coloured Gaussian prior fitted to training ep
 
 from pathlib import Path
 
-import numpy as np
-
-from eitbench import Estimate, Task
+from eitbench import Task
 from eitbench.estimation import (
     FilterEstimator,
     SwitchingInflowFilter,
@@ -20,19 +18,16 @@ LEVEL_STD = 0.05
 """Standard deviation of the inflow between slugs, relative to the best homogeneous estimate."""
 
 
-class Estimator:
+class Estimator(FilterEstimator):
     subtracks = ("filter",)
     parameters = {"level_std": LEVEL_STD}  # noqa: RUF012 (as a record has it)
 
     def __init__(self, task: Task) -> None:
         prior = compatible_priors(PRIORS, task, LINK)[0]
-        self.estimator = FilterEstimator(task, lambda c_ref: SwitchingInflowFilter(
+        super().__init__(task, lambda c_ref: SwitchingInflowFilter(
             task, prior, c_ref, LEVEL_STD, linearise_at_prediction(task)))
 
     @staticmethod
     def suits(task: Task) -> bool:
         priors = compatible_priors(PRIORS, task, LINK)
         return task.velocity is None and bool(priors) and priors[0].regimes is not None
-
-    def update(self, voltages: np.ndarray, currents: np.ndarray) -> Estimate | None:
-        return self.estimator.update(voltages, currents)

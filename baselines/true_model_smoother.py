@@ -17,9 +17,9 @@ from eitbench.estimation import (
     DenseCovariance,
     Filter,
     LinearisedForwardModel,
-    Motion,
     NodalStates,
     compatible_priors,
+    flow_motion,
     initial_covariance,
     map_inflow,
     nodal_filter,
@@ -70,22 +70,15 @@ class Estimator:
 
 
 def changing_states(task: Task, transport_at, c_ref: float) -> NodalStates:
-    """Return the states of Table 5.1 in a flow that changes at each step; the nodal part of the
-    noise is computed for the nominal flow, as in `VelocityStates`."""
-    prior = task.prior
-    nodal = task.evolution.state_noise_covariance(0.0, (c_ref * prior.nodal_std)**2)
+    """Return the states of Table 5.1 in a flow that changes at each step."""
 
     @cache
     def transition(time: int):
         return transport_at(time).transition()
 
-    def motion(time: int) -> Motion:
-        F, Y = transition(time)
-        noise = (c_ref * prior.inflow_std)**2 * (Y @ Y.T) + nodal
-        return Motion(F, c_ref * Y.sum(axis=1), noise)
-
-    covariance = c_ref**2 * initial_covariance(task.mesh, prior)
-    return NodalStates(np.full(task.mesh.n_nodes, c_ref), DenseCovariance(covariance), motion)
+    covariance = c_ref**2 * initial_covariance(task.mesh, task.prior)
+    return NodalStates(np.full(task.mesh.n_nodes, c_ref), DenseCovariance(covariance),
+                       lambda time: flow_motion(task, transition(time), c_ref))
 
 
 def closest(model, velocity: np.ndarray) -> np.ndarray:

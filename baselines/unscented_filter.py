@@ -4,9 +4,7 @@ electrode model evaluated at sigma points along the principal axes of the concen
 
 from pathlib import Path
 
-import numpy as np
-
-from eitbench import Estimate, Task
+from eitbench import Task
 from eitbench.estimation import FilterEstimator, InflowWindow, UnscentedFilter, compatible_priors
 
 PRIORS = Path(__file__).with_name("priors")
@@ -15,7 +13,7 @@ AXES = 40
 """Number of principal axes; one step needs 81 forward solutions."""
 
 
-class Estimator:
+class Estimator(FilterEstimator):
     subtracks = ("filter",)
     parameters = {"axes": AXES}  # noqa: RUF012 (as a record has it)
 
@@ -27,13 +25,10 @@ class Estimator:
             return UnscentedFilter(space, task.observation.transfer_resistance, task.noise,
                                    space.response().basis, AXES)
 
-        self.estimator = FilterEstimator(task, start)
+        super().__init__(task, start)
 
     @staticmethod
     def suits(task: Task) -> bool:
         # in 3D the forward solutions of one step take seconds
         known_flow = task.velocity is None and task.mesh.dim == 2
         return known_flow and bool(compatible_priors(PRIORS, task, LINK))
-
-    def update(self, voltages: np.ndarray, currents: np.ndarray) -> Estimate | None:
-        return self.estimator.update(voltages, currents)

@@ -9,13 +9,13 @@ import pytest
 
 ROOT = Path(__file__).parent.parent
 PACKAGE = ROOT / "eitbench"
-BUDGETS = {"numerics": 1590, "scoring": 110, "physics": 1420, "worlds": 2700, "data": 1530, "estimation": 5810,
+BUDGETS = {"numerics": 1590, "scoring": 110, "physics": 1420, "worlds": 2700, "data": 1530, "estimation": 5770,
            "measured": 1915, "envs": 1675, "bench": 5195, "report": 3150, "rl": 815, "cli": 1005}
 """Package (or module) -> lines of Python allowed, blank lines and docstrings included. Each imports only from those
 before it."""
 TOP = 430
 """Lines allowed in the other modules at the top: public names, argument checks, files, messages."""
-BASELINES = 2045
+BASELINES = 1850
 TESTS = 20_500
 MODULES = {".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__"): path
            for path in PACKAGE.rglob("*.py")}

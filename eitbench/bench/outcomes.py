@@ -14,7 +14,7 @@ from eitbench.data.episode_cache import region_operators
 from eitbench.data.episodes import cached_truth_model, simulate
 from eitbench.envs.estimation import EstimationEnv
 from eitbench.estimation import best_homogeneous
-from eitbench.estimation.onboard.innovation import Innovation
+from eitbench.estimation.onboard.episode_filters import Innovation
 from eitbench.worlds.task import Estimate, Task
 from eitbench.worlds.world import World
 

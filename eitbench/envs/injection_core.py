@@ -10,7 +10,7 @@ from gymnasium import spaces
 
 from eitbench.data.episode_cache import instrument_faults, integrals, score_mass, scoring_constants
 from eitbench.envs.episodes import EpisodeCore, Observation
-from eitbench.estimation.onboard.innovation import Innovation
+from eitbench.estimation.onboard.episode_filters import Innovation
 from eitbench.estimation.onboard.onboard_filter import OnboardFilter, filters_class
 from eitbench.estimation.onboard.rules import Rules
 from eitbench.worlds.instrument import Faults

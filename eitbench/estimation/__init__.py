@@ -2,14 +2,13 @@
 
 from eitbench.estimation.correction import (
     FilterFeatures,
+    NetworkCorrectedFilter,
     VoltageFeatures,
     apply_correction,
     gru_step,
     initial_hidden_state,
     load_network,
-    network_estimator,
     network_matches_task,
-    network_output,
 )
 from eitbench.estimation.covariance import (
     DenseCovariance,
@@ -17,7 +16,7 @@ from eitbench.estimation.covariance import (
     OpenLoopCovariance,
 )
 from eitbench.estimation.ensemble import EnsembleFilter
-from eitbench.estimation.estimators import CalibrationFrame, FilterEstimator, SmootherEstimator
+from eitbench.estimation.estimators import CalibrationFrame, FilterEstimator, RecordSmoother
 from eitbench.estimation.filter import Filter, StateSpace, Step, kalman_filter
 from eitbench.estimation.forward import (
     LinearisedForwardModel,
@@ -25,8 +24,8 @@ from eitbench.estimation.forward import (
     linearise_at_reference,
     linearise_voltages,
 )
-from eitbench.estimation.gauss_newton import gauss_newton
-from eitbench.estimation.gaussian import Innovation, LinearMeasurement, condition, innovate
+from eitbench.estimation.gauss_newton import StationaryMap, gauss_newton
+from eitbench.estimation.gaussian import LinearMeasurement, condition, innovate
 from eitbench.estimation.homogeneous import best_homogeneous
 from eitbench.estimation.identification import identify_model
 from eitbench.estimation.identified import IdentifiedModel, compatible_models
@@ -50,6 +49,7 @@ from eitbench.estimation.nodal import (
     LogStates,
     Motion,
     NodalStates,
+    flow_motion,
     initial_covariance,
     modal_states,
     nodal_filter,
@@ -76,17 +76,17 @@ from eitbench.estimation.velocity import (
 __all__ = [
     "CalibrationFrame", "DenseCovariance", "EnsembleFilter", "Filter", "FilterEstimator",
     "FilterFeatures", "IdentifiedModel", "ImpulseResponse", "InflowPrior", "InflowWindow",
-    "Innovation", "LinearMeasurement", "LinearisedForwardModel", "LogStates", "LowRankCovariance",
-    "Motion", "NodalStates", "OpenLoopCovariance", "ParticleInflowFilter", "QuadraticVoltageModel",
-    "Regimes", "ScaledVoltageModel", "SmootherEstimator", "StateSpace", "Step",
-    "SwitchingInflowFilter", "UnscentedFilter", "VelocityInflowWindow", "VelocityPrior",
-    "VelocityStates", "VoltageFeatures", "apply_correction", "best_homogeneous",
+    "LinearMeasurement", "LinearisedForwardModel", "LogStates", "LowRankCovariance", "Motion",
+    "NetworkCorrectedFilter", "NodalStates", "OpenLoopCovariance", "ParticleInflowFilter",
+    "QuadraticVoltageModel", "RecordSmoother", "Regimes", "ScaledVoltageModel", "StateSpace",
+    "StationaryMap", "Step", "SwitchingInflowFilter", "UnscentedFilter", "VelocityInflowWindow",
+    "VelocityPrior", "VelocityStates", "VoltageFeatures", "apply_correction", "best_homogeneous",
     "compatible_models", "compatible_priors", "condition", "fit_inflow_prior",
-    "fit_prior_from_episodes", "fixed_interval_smoother", "full_window_filter", "gauss_newton",
-    "gru_step", "identify_model", "inflow_filter", "initial_covariance", "initial_hidden_state",
-    "innovate", "kalman_filter", "linearise_at_prediction", "linearise_at_reference",
-    "linearise_voltages", "load_network", "map_inflow", "maximise_posterior", "modal_states",
-    "network_estimator", "network_matches_task", "network_output", "nodal_filter", "nodal_states",
+    "fit_prior_from_episodes", "fixed_interval_smoother", "flow_motion", "full_window_filter",
+    "gauss_newton", "gru_step", "identify_model", "inflow_filter", "initial_covariance",
+    "initial_hidden_state", "innovate", "kalman_filter", "linearise_at_prediction",
+    "linearise_at_reference", "linearise_voltages", "load_network", "map_inflow",
+    "maximise_posterior", "modal_states", "network_matches_task", "nodal_filter", "nodal_states",
     "reduced_response", "scaled_velocity_prior", "smooth_means", "smooth_state",
     "smoothness_covariance", "steady_response", "table_5_1_filter", "task_velocity_prior",
     "time_varying_responses", "velocity_states",

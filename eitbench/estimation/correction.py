@@ -6,15 +6,15 @@ step it predicts a correction of the modes and the variance of each corrected mo
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from eitbench.estimation.estimators import FilterEstimator, Measurement
-from eitbench.estimation.identified import FINGERPRINT_ATOL, task_fingerprint
+from eitbench.estimation.estimators import Measurement
+from eitbench.estimation.identified import has_fingerprint
 from eitbench.estimation.inflow_window import inflow_filter
 from eitbench.worlds.task import Estimate
 
@@ -39,11 +39,8 @@ def network_matches_task(path: Path, task: Task) -> bool:
     if not path.is_file():
         return False
     known = load_network(path)
-    if task.velocity is not None or task.mesh.n_nodes != len(known["basis"]):
-        return False
-    fingerprint = task_fingerprint(task)
-    return fingerprint.shape == known["task"].shape and np.allclose(
-        fingerprint, known["task"], atol=FINGERPRINT_ATOL)
+    return (task.velocity is None and task.mesh.n_nodes == len(known["basis"])
+            and has_fingerprint(task, known["task"]))
 
 
 # -- the network -----------------------------------------------------------------------------------
@@ -105,11 +102,8 @@ class FilterFeatures:
 
     Parameters
     ----------
-    task : Task
-    prior : InflowPrior
-        Prior for the task's inlet.
-    c_ref : float
-        ĉ_bh in mol/m³.
+    task, prior, c_ref
+        As in `InflowWindow`.
     basis : (n, q)
         Modes of c/ĉ_bh − 1.
     lag : int
@@ -166,6 +160,7 @@ class VoltageFeatures:
 
     def __init__(self, task: Task, c_ref: float, basis: np.ndarray) -> None:
         self.task = task
+        self.c_ref = c_ref
         homogeneous = np.full(task.mesh.n_nodes, c_ref)
         self.expected = task.observation.voltages(homogeneous, task.currents)
         self.none = np.zeros(basis.shape[1])
@@ -179,7 +174,7 @@ class VoltageFeatures:
         return np.outer(here, off).ravel(), self.none
 
 
-# -- estimators ------------------------------------------------------------------------------------
+# -- filter ----------------------------------------------------------------------------------------
 
 
 class NetworkCorrectedFilter:
@@ -191,29 +186,25 @@ class NetworkCorrectedFilter:
     ----------
     network : mapping
         As returned by `load_network`.
-    seen : FilterFeatures or VoltageFeatures
+    features : FilterFeatures or VoltageFeatures
         Inputs of the network; `VoltageFeatures` has no lag.
-    lag : int
-        Lag of the task in time steps.
     """
 
-    def __init__(self, network: Network, seen: FilterFeatures | VoltageFeatures, c_ref: float,
-                 lag: int = 0) -> None:
+    def __init__(self, network: Network, features: FilterFeatures | VoltageFeatures) -> None:
         self.network = network
-        self.seen = seen
-        self.c_ref = c_ref
-        self.lag = lag
+        self.features = features
+        self.lag = features.task.lag
         self._hidden_state = initial_hidden_state(network)
         self._measured = 0
 
     def assimilate(self, voltages: np.ndarray, currents: np.ndarray) -> None:
         """Pass one measurement vector, (L,) in V and in A, to the network."""
-        inputs, reduced = self.seen(voltages, currents)
+        inputs, reduced = self.features(voltages, currents)
         self._measured += 1
-        if self.lag and isinstance(self.seen, FilterFeatures):
+        if self.lag and isinstance(self.features, FilterFeatures):
             if self._measured <= self.lag:
                 return
-            reduced = self.seen.modes(self.lag)
+            reduced = self.features.modes(self.lag)
             inputs = np.concatenate([inputs, reduced])
         self._hidden_state = gru_step(self.network, inputs, self._hidden_state)
         self._last = reduced, inputs
@@ -221,17 +212,10 @@ class NetworkCorrectedFilter:
     def estimate(self, lag: int = 0) -> Estimate:
         """Return the state ``lag`` steps ago."""
         if lag < self.lag:
-            assert isinstance(self.seen, FilterFeatures)
-            return self.seen.filter.estimate(lag)
-        return apply_correction(self.network, self.c_ref, *self._last, self._hidden_state)
-
-
-def network_estimator(
-        task: Task, network: Network,
-        see: Callable[[float], FilterFeatures | VoltageFeatures]) -> FilterEstimator:
-    """Return the estimator of a network; ``see`` maps ĉ_bh in mol/m³ to its inputs."""
-    return FilterEstimator(task, lambda c_ref: NetworkCorrectedFilter(network, see(c_ref), c_ref,
-                                                               task.lag))
+            assert isinstance(self.features, FilterFeatures)
+            return self.features.filter.estimate(lag)
+        return apply_correction(self.network, self.features.c_ref, *self._last,
+                                self._hidden_state)
 
 
 def injection_one_hot(task: Task, currents: np.ndarray) -> np.ndarray:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from copy import copy
+from functools import cached_property
 from itertools import pairwise
 from typing import Protocol, Self
 
@@ -15,6 +17,9 @@ _BLOCK = 128
 """Number of columns copied at once when a triangle is mirrored; a block fits the CPU cache."""
 _PANEL = 64
 """Number of columns passed to a callable transition at once; a panel fits the CPU cache."""
+
+TRANSIENT_TOLERANCE = 1e-14
+"""Eigenvalues of the transient U D Uᵀ below this part of Π_∞'s largest entry are dropped."""
 
 Transition = np.ndarray | Callable[[np.ndarray], np.ndarray]
 """F (n, n), or X (n, k) -> F X."""
@@ -36,7 +41,7 @@ class Covariance(Protocol):
 
     def propagate(self, transition: Transition | None,
                   noise: np.ndarray | None = None) -> Self:
-        """Return F P Fᵀ + Q."""
+        """Return F P Fᵀ + Q; None: F = I, Q = 0."""
 
     def subtract(self, root: np.ndarray) -> Self:
         """Return P − G Gᵀ, with G (n, m)."""
@@ -48,41 +53,38 @@ class Covariance(Protocol):
         """Return the variances (n,)."""
 
     def variance_of(self, functionals: np.ndarray) -> np.ndarray:
-        """Return the variances (k,) of linear functionals (k, n) of the state."""
+        """Return the variances (m,) of linear functionals (m, k) of the first k entries."""
 
 
-class DenseCovariance:
+class DenseCovariance(Covariance):
     """Covariance stored as a symmetric matrix P (n, n), modified in place.
 
-    It supports time-varying transitions, F = I and windows. Negative diagonal entries are set to
-    zero. ``ValueError`` if the matrix is not square or not finite.
+    It supports time-varying transitions, F = I and windows. A transition given as a callable is
+    faster where F X costs far less than a product of dense matrices, such as solves with a sparse
+    matrix: it is called twice for n columns. Negative diagonal entries are set to zero.
+    ``ValueError`` if the matrix is not square or not finite.
     """
 
     def __init__(self, covariance: np.ndarray) -> None:
         n = len(covariance)
         covariance = _check.array("covariance", covariance, (n, n))
         self._array = np.ascontiguousarray(0.5 * (covariance + covariance.T))
-        self._work: np.ndarray | None = None
 
     @property
     def array(self) -> np.ndarray:
-        """(n, n) P."""
         return self._array
 
+    @cached_property
+    def _work(self) -> np.ndarray:
+        return np.empty_like(self._array)
+
     def copy(self) -> Self:
-        """Return an independent copy."""
         return type(self)(self._array)
 
     def times(self, X: np.ndarray) -> np.ndarray:
-        """Return P X for X (k, m), whose rows belong to the first k entries of the state."""
         return self._array[:, :len(X)] @ X
 
     def propagate(self, transition: Transition | None, noise: np.ndarray | None = None) -> Self:
-        """Return F P Fᵀ + Q, in place; None: F = I, Q = 0.
-
-        A callable is faster where F X costs far less than a product of dense matrices, such as
-        solves with a sparse matrix: it is called twice for n columns.
-        """
         if callable(transition):
             self._transform_by_columns(transition)
         elif transition is not None:
@@ -111,29 +113,21 @@ class DenseCovariance:
         return self
 
     def subtract(self, root: np.ndarray) -> Self:
-        """Return P − G Gᵀ, with G (n, m), in place."""
-        self._array -= np.matmul(root, root.T, out=self._scratch())
+        self._array -= np.matmul(root, root.T, out=self._work)
         diagonal = np.einsum("ii->i", self._array)                                      # a view
         np.maximum(diagonal, 0.0, out=diagonal)  # rounding may make small variances negative
         return self
 
     def diagonal(self) -> np.ndarray:
-        """Return the variances (n,)."""
         return self._array.diagonal().copy()
 
     def variance_of(self, functionals: np.ndarray) -> np.ndarray:
-        """Return the variances (m,) of linear functionals (m, k) of the first k entries."""
         k = functionals.shape[1]
         return ((functionals @ self._array[:k, :k]) * functionals).sum(axis=1)
 
-    def _scratch(self) -> np.ndarray:
-        if self._work is None:
-            self._work = np.empty_like(self._array)
-        return self._work
-
     def _transform(self, F: np.ndarray) -> None:
         """P ← F P Fᵀ by triangles: with P = L + Lᵀ and B = F L, half of B Fᵀ + F Bᵀ is computed."""
-        P, B = self._array, self._scratch()
+        P, B = self._array, self._work
         diagonal = np.einsum("ii->i", P)
         diagonal *= 0.5
         np.copyto(B, F)
@@ -145,7 +139,7 @@ class DenseCovariance:
 
     def _transform_by_columns(self, apply: Callable[[np.ndarray], np.ndarray]) -> None:
         """P ← F P Fᵀ as F (F P)ᵀ; only the upper triangle is used."""
-        P, B = self._array, self._scratch()
+        P, B = self._array, self._work
         panels = [slice(begin, begin + _PANEL) for begin in range(0, len(P), _PANEL)]
         for panel in panels:
             B[:, panel] = apply(P[:, panel])
@@ -177,41 +171,28 @@ class OpenLoopCovariance:
         Γ_w.
     initial : (n, n), optional
         Γ_{0|0}; by default Π_∞.
-    tolerance : float
-        Eigenvalues of U D Uᵀ below this part of Π_∞'s largest entry are dropped.
     """
 
     def __init__(self, transition: np.ndarray, noise: np.ndarray,
-                 initial: np.ndarray | None = None, *, tolerance: float = 1e-14) -> None:
-        self.scale = 1.0
+                 initial: np.ndarray | None = None) -> None:
         self.transition = transition
-        self._noise = noise
+        self.noise = noise
         self.limit = _stationary(transition, noise)
-        self._threshold = tolerance * np.abs(self.limit).max()
+        self._threshold = TRANSIENT_TOLERANCE * np.abs(self.limit).max()
         left = (np.zeros((len(noise), 0)), np.zeros(0))
         if initial is not None:
             left = _signed_factor(initial - self.limit, self._threshold)
         self._transients = [left]  # (U, D) at t = 0, 1, …
 
-    def scale_by(self, factor: float) -> OpenLoopCovariance:
-        """Return the same sequence times ``factor``, sharing all matrices."""
-        other = object.__new__(OpenLoopCovariance)
-        other.__dict__ = self.__dict__ | {"scale": self.scale * factor}
-        return other
-
     def apply(self, t: int, X: np.ndarray) -> np.ndarray:
         """Return Π_t X for X (n, k)."""
         U, signs = self._transient(t)
-        return self.scale * (self.limit @ X + U @ (signs[:, None] * (U.T @ X)))
-
-    def apply_noise(self, X: np.ndarray) -> np.ndarray:
-        """Return Γ_w X for X (n,) or (n, k)."""
-        return self.scale * (self._noise @ X)
+        return self.limit @ X + U @ (signs[:, None] * (U.T @ X))
 
     def diagonal(self, t: int) -> np.ndarray:
         """Return the variances (n,) of Π_t."""
         U, signs = self._transient(t)
-        return self.scale * (self.limit.diagonal() + (U**2) @ signs)
+        return self.limit.diagonal() + (U**2) @ signs
 
     def _transient(self, t: int) -> tuple[np.ndarray, np.ndarray]:
         while len(self._transients) <= t:
@@ -225,63 +206,68 @@ class OpenLoopCovariance:
         return self._transients[t]
 
 
-class LowRankCovariance:
-    """Covariance P_t = Π_t − Z Zᵀ: few measurements of a large state, without n×n products.
+class LowRankCovariance(Covariance):
+    """Covariance P_t = s Π_t − Z Zᵀ: few measurements of a large state, without n×n products.
 
     Measurements add columns to Z (n, r), which is propagated by F and truncated to its numerical
-    rank, far below n (``docs/methods.md``, 5).
+    rank, far below n (``docs/methods.md``, 5). F and Q are those of the open-loop covariance.
 
     Parameters
     ----------
     open_loop : OpenLoopCovariance
-        Π_t; Π_0 is the initial covariance.
+        Π_t; s Π_0 is the initial covariance.
     rank_tolerance : float
         Singular values of Z below this fraction of the largest are dropped; the relative error of
         the covariance is its square.
+    scale : float
+        s.
     """
 
-    def __init__(self, open_loop: OpenLoopCovariance, rank_tolerance: float = 1e-6, *,
-                 time: int = 0, assimilated: np.ndarray | None = None) -> None:
+    def __init__(self, open_loop: OpenLoopCovariance, rank_tolerance: float = 1e-6,
+                 scale: float = 1.0) -> None:
         self.open_loop = open_loop
         self.rank_tolerance = rank_tolerance
-        self.time = time
-        self.assimilated = (np.zeros((len(open_loop.limit), 0)) if assimilated is None
-                            else assimilated)
+        self.scale = scale
+        self.time = 0
+        self.assimilated = np.zeros((len(open_loop.limit), 0))
         """(n, r) Z"""
 
     def _with(self, time: int, assimilated: np.ndarray) -> Self:
-        return type(self)(self.open_loop, self.rank_tolerance, time=time, assimilated=assimilated)
+        other = copy(self)
+        other.time = time
+        other.assimilated = assimilated
+        return other
 
     @property
     def array(self) -> np.ndarray:
-        """(n, n) P, recomputed at each access."""
         return self.times(np.eye(len(self.assimilated)))
 
     def copy(self) -> Self:
-        """Return the object itself, which is immutable."""
         return self
 
     def times(self, X: np.ndarray) -> np.ndarray:
-        """Return P X for X (n, m)."""
-        return self.open_loop.apply(self.time, X) - self.assimilated @ (self.assimilated.T @ X)
+        free = self.scale * self.open_loop.apply(self.time, X)
+        return free - self.assimilated @ (self.assimilated.T @ X)
+
+    def times_noise(self, X: np.ndarray) -> np.ndarray:
+        """Return Q X for X (n,) or (n, k)."""
+        return self.scale * (self.open_loop.noise @ X)
 
     def propagate(self, transition: Transition | None, noise: np.ndarray | None = None) -> Self:
-        """Return F P Fᵀ + Q, with the F and Q of the open-loop covariance."""
         return self._with(self.time + 1, self.open_loop.transition @ self.assimilated)
 
     def subtract(self, root: np.ndarray) -> Self:
-        """Return P − G Gᵀ, with G (n, m)."""
         columns = np.hstack([self.assimilated, root])
         return self._with(self.time, truncate_columns(columns, self.rank_tolerance))
 
     def diagonal(self) -> np.ndarray:
-        """Return the variances (n,)."""
-        return self.open_loop.diagonal(self.time) - (self.assimilated**2).sum(axis=1)
+        free = self.scale * self.open_loop.diagonal(self.time)
+        return free - (self.assimilated**2).sum(axis=1)
 
     def variance_of(self, functionals: np.ndarray) -> np.ndarray:
-        """Return the variances (m,) of linear functionals (m, n) of the state."""
-        free = (functionals * self.open_loop.apply(self.time, functionals.T).T).sum(axis=1)
-        return free - ((functionals @ self.assimilated)**2).sum(axis=1)
+        free = self.scale * self.open_loop.apply(self.time, functionals.T)
+        return ((functionals * free.T).sum(axis=1)
+                - ((functionals @ self.assimilated)**2).sum(axis=1))
 
 
 def truncate_columns(Z: np.ndarray, tolerance: float) -> np.ndarray:

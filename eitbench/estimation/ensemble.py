@@ -30,16 +30,12 @@ class EnsembleFilter:
     is linearised about the mean concentration and updates mean and deviations by the symmetric
     square root (Hunt, Kostelich & Szunyogh, Physica D 230, 2007), without perturbed measurements.
 
-    The velocity of each member stays within the flow's bounds. ``ValueError`` naming the argument
-    if it is out of range, or if the prior is for another inlet.
+    The velocity of each member stays within the flow's bounds.
 
     Parameters
     ----------
-    task : Task
-    prior : InflowPrior
-        Prior for the task's inlet.
-    c_ref : float
-        ĉ_bh in mol/m³, the concentration in the pipe before the first inflow.
+    task, prior, c_ref
+        As in `InflowWindow`.
     flow : VelocityPrior
         Parameters with zero standard deviation are fixed.
     members : int
@@ -64,7 +60,7 @@ class EnsembleFilter:
         self._forward = forward
         self._innovation: tuple[np.ndarray, np.ndarray] | tuple[None, None] = (None, None)
         covariance = prior.time_covariance(prior.correlation_steps + 2)
-        before, (self._weights, self._variance) = yule_walker(covariance)
+        before, self._weights, self._variance = yule_walker(covariance)
         independent = random.standard_normal((len(before), prior.modes.shape[1], N))
         self.inflows = np.tensordot(np.linalg.cholesky(before), independent, 1)
         """(P, r, N) last x of each member, the newest first"""

@@ -1,4 +1,4 @@
-"""Estimators based on filters and smoothers, from the calibration frame to the last measurement."""
+"""Estimators from filters and smoothers: calibration frame, lag, and the last measurements."""
 
 from __future__ import annotations
 
@@ -105,33 +105,26 @@ class FilterEstimator:
         return estimate
 
 
-class SmootherEstimator:
-    """Estimator that smooths a complete measurement sequence, and returns None until its end.
+class RecordSmoother:
+    """Smoother of a complete measurement sequence, for `FilterEstimator` in the smoothing subtrack.
 
     Parameters
     ----------
-    task : Task
-        Task of the smoothing subtrack.
     smooth : callable
-        ĉ_bh in mol/m³ and the measurements t = 1 … T -> the estimates of their states.
+        Measurements t = 1 … T -> the estimates of their states.
     """
 
-    def __init__(self, task: Task,
-                 smooth: Callable[[float, Sequence[Measurement]], Sequence[Estimate]]) -> None:
-        self.task = task
+    def __init__(self, smooth: Callable[[Sequence[Measurement]], Sequence[Estimate]]) -> None:
         self._smooth = smooth
         self._record: list[Measurement] = []
-        self._requested = 0
+        self._estimates: Sequence[Estimate] = ()
 
-    def update(self, voltages: np.ndarray, currents: np.ndarray) -> Estimate | None:
-        """Return the states one by one, after the last measurement vector, (L,) V and A each."""
-        if len(self._record) < self.task.n_steps:
-            self._record.append((voltages, currents))
-            if len(self._record) < self.task.n_steps:
-                return None
-            first = CalibrationFrame(self.task)
-            for measurement in self._record[:first.length]:
-                first.add(*measurement)
-            self._estimates = self._smooth(first.c_ref, self._record)
-        self._requested += 1
-        return self._estimates[self._requested - 1]
+    def assimilate(self, voltages: np.ndarray, currents: np.ndarray) -> None:
+        """Store a measurement vector."""
+        self._record.append((voltages, currents))
+
+    def estimate(self, lag: int = 0) -> Estimate:
+        """Return the state ``lag`` steps before the last, given all measurements so far."""
+        if len(self._estimates) < len(self._record):
+            self._estimates = self._smooth(self._record)
+        return self._estimates[-1 - lag]

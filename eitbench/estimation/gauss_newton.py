@@ -1,4 +1,4 @@
-"""Stationary reconstruction from one frame, for a target at a fixed position (thesis 5.11)."""
+"""Gauss–Newton, and reconstruction of a target at a fixed position (thesis 5.11)."""
 
 from __future__ import annotations
 
@@ -10,15 +10,19 @@ import numpy as np
 import scipy.sparse as sp
 from scipy.linalg import cho_factor, cho_solve, lu_factor, lu_solve
 
+from eitbench.estimation.nodal import initial_covariance
 from eitbench.numerics.sparse_lu import SparseLU
+from eitbench.worlds.task import Estimate
 
 if TYPE_CHECKING:
     from eitbench.physics.observation import VoltageModel
+    from eitbench.worlds.task import Task
 
 
 def gauss_newton(model: VoltageModel, voltages: np.ndarray, currents: np.ndarray,
                  noise_std: np.ndarray, penalty: Any, start: np.ndarray, *,
-                 tolerance: float = 1e-3, max_iterations: int = 20) -> np.ndarray:
+                 tolerance: float = 1e-3, step_tolerance: float = 0.0,
+                 max_iterations: int = 20) -> np.ndarray:
     """Return argmin_c ‖(V − R(c))/std‖² + cᵀ penalty c, by Gauss–Newton with step halving.
 
     (n,) in mol/m³; the best iterate if ``max_iterations`` run out or no step lowers the objective.
@@ -35,6 +39,8 @@ def gauss_newton(model: VoltageModel, voltages: np.ndarray, currents: np.ndarray
         Initial guess in mol/m³.
     tolerance : float
         Stop when a full step would lower the objective by a smaller relative amount.
+    step_tolerance : float
+        Stop when a full step would change all entries of c by less.
     """
     normal = _NormalEquations(penalty)
     missing = np.isnan(voltages)
@@ -52,7 +58,8 @@ def gauss_newton(model: VoltageModel, voltages: np.ndarray, currents: np.ndarray
         gradient = A.T @ residual - penalty @ c
         direction = normal.solve(A, gradient)
         now = misfit(c, computed)
-        last = gradient @ direction < tolerance * now
+        last = (gradient @ direction < tolerance * now
+                or np.abs(direction).max() < step_tolerance)
         length = 1.0
         while True:
             trial = c + length * direction
@@ -69,6 +76,52 @@ def gauss_newton(model: VoltageModel, voltages: np.ndarray, currents: np.ndarray
         if last:
             break
     return c
+
+
+class StationaryMap:
+    """Maximum a posteriori of a stationary target given all measurements so far, for
+    `FilterEstimator`.
+
+    A function u of the relative concentration c/ĉ_bh has the prior N(0, Γ_{0|0}) of the Kalman
+    filter. Each estimate starts from the one before.
+
+    Parameters
+    ----------
+    task : Task
+    c_ref : float
+        ĉ_bh in mol/m³.
+    relative : callable
+        u (n,) -> c/ĉ_bh and its derivative by u, node by node.
+    """
+
+    def __init__(self, task: Task, c_ref: float,
+                 relative: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]) -> None:
+        self.task = task
+        self.c_ref = c_ref
+        self.relative = relative
+        self._penalty = np.linalg.inv(initial_covariance(task.mesh, task.prior))
+        self._u = np.zeros(task.mesh.n_nodes)
+        self._record: list[tuple[np.ndarray, np.ndarray]] = []
+
+    def assimilate(self, voltages: np.ndarray, currents: np.ndarray) -> None:
+        """Store a measurement vector."""
+        self._record.append((voltages, currents))
+
+    def estimate(self, lag: int = 0) -> Estimate:
+        """Return the reconstruction."""
+        V, I = (np.array(part) for part in zip(*self._record, strict=True))
+        self._u = gauss_newton(self, V, I, self.task.noise.std(V), self._penalty, self._u)
+        return Estimate(self.c_ref * self.relative(self._u)[0])
+
+    def voltages(self, u: np.ndarray, currents: np.ndarray) -> np.ndarray:
+        """Return voltages (K, L) in V; with `linearise` this is a `VoltageModel` of u."""
+        return self.task.observation.voltages(self.c_ref * self.relative(u)[0], currents)
+
+    def linearise(self, u: np.ndarray, currents: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return voltages (K, L) in V, and their derivatives (K, L, n) by u."""
+        relative, derivative = self.relative(u)
+        voltages, by_c = self.task.observation.linearise(self.c_ref * relative, currents)
+        return voltages, by_c * (self.c_ref * derivative)
 
 
 class _NormalEquations:

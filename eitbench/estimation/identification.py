@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
+from functools import reduce
+from operator import add
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -105,8 +107,8 @@ def identify_model(examples: Dataset, *, modes: int = 64, residual_only: bool = 
     if residual_only:
         known = told_response.basis @ (told_response.weights @ across).reshape(-1, known.shape[1])
         folds = CV_FOLDS
-    parts = [_moments(progress(replace(examples, seeds=examples.seeds[fold::folds])), world, task,
-                      across, known, linearised) for fold in range(folds)]
+    parts = [_together(_moments(each, world, task, across, known, linearised) for each in progress(
+        replace(examples, seeds=examples.seeds[fold::folds]))) for fold in range(folds)]
     moments = _together(parts)
     mass = examples.mass.toarray()
     root = np.linalg.cholesky(mass)
@@ -127,8 +129,8 @@ def identify_model(examples: Dataset, *, modes: int = 64, residual_only: bool = 
                            scatter if linearised else None)
 
 
-def _together(parts: list[RegressionSums]) -> RegressionSums:
-    return RegressionSums(*(sum(each) for each in zip(*parts, strict=True)))  # type: ignore[arg-type]
+def _together(parts: Iterable[RegressionSums]) -> RegressionSums:
+    return reduce(lambda one, other: RegressionSums(*map(add, one, other)), parts)
 
 
 def _regressed(moments: RegressionSums, to_modes: np.ndarray,
@@ -151,7 +153,7 @@ def _ridge(parts: list[RegressionSums], to_modes: np.ndarray) -> float:
         return DEFAULT_RIDGE
     losses = np.zeros(len(CV_RIDGES))
     for part in parts:
-        others = _together([each for each in parts if each is not part])
+        others = _together(each for each in parts if each is not part)
         values, directions = np.linalg.eigh(others.inflow)
         theirs = directions.T @ others.cross @ to_modes
         ours = directions.T @ part.cross @ to_modes
@@ -170,49 +172,39 @@ def _across(world: World, seeds: Iterable[int]) -> np.ndarray:
     return vectors[:, values > INLET_VARIANCE_CUTOFF * values.sum()][:, ::-1]
 
 
-def _moments(examples: Iterable[Example], world: World, task: Task, across: np.ndarray,
-             known: np.ndarray, linearised: bool) -> RegressionSums:
-    """Return the sums over examples, minus the response ``known`` (n, K·r) to past inflows."""
-    n, size = known.shape
-    count = 0
-    inflow, cross = np.zeros((size, size)), np.zeros((size, n))
-    left, state = np.zeros((n, n)), np.zeros((n, n))
+def _moments(example: Example, world: World, task: Task, across: np.ndarray, known: np.ndarray,
+             linearised: bool) -> RegressionSums:
+    """Return the sums over an episode, minus the response ``known`` (n, K·r) to past inflows."""
+    s = inflow_regressors(world.sample_inflow(example.seed) / world.background - 1.0, across,
+                          len(example.truth), known.shape[1] // across.shape[1])
+    d = example.truth / world.background - 1.0
+    l = d - s @ known.T
+    steps, errors = _errors(task, example, linearised)
     P, L = task.currents.shape
     off, scatter = np.zeros((P, L)), np.zeros((P, L, L))
-    compared = np.zeros(P)
-    for example in examples:
-        s = inflow_regressors(world.sample_inflow(example.seed) / world.background - 1.0, across,
-                              len(example.truth), size // across.shape[1])
-        d = example.truth / world.background - 1.0
-        l = d - s @ known.T
-        inflow += s.T @ s
-        cross += s.T @ l
-        left += l.T @ l
-        state += d.T @ d
-        count += len(d)
-        for t, error in _errors(task, example, linearised):
-            off[t % P] += error
-            scatter[t % P] += np.outer(error, error)
-            compared[t % P] += 1
-    return RegressionSums(count, inflow, cross, left, state, off, scatter, compared)
+    np.add.at(off, steps % P, errors)
+    np.add.at(scatter, steps % P, errors[:, :, None] * errors[:, None])
+    return RegressionSums(len(d), s.T @ s, s.T @ l, l.T @ l, d.T @ d, off, scatter,
+                          np.bincount(steps % P, minlength=P))
 
 
-def _errors(task: Task, example: Example, linearised: bool) -> Iterator[tuple[int, np.ndarray]]:
-    """Yield t and measured minus computed voltages (L,) at the true states t + 1, in standard
-    deviations of the noise."""
+def _errors(task: Task, example: Example, linearised: bool) -> tuple[np.ndarray, np.ndarray]:
+    """Return indices (S,) of measurement vectors, and measured minus computed voltages (S, L) at
+    their true states, in standard deviations of the noise."""
     truth = example.truth.astype(float)
     if linearised:
         first = CalibrationFrame(task)
         for t in range(first.length):
             first.add(example.voltages[t], example.currents[t])
         observe = LinearisedForwardModel(task.observation, task.noise, first.mean)
-        for t, c in enumerate(truth):
-            seen = observe(example.voltages[t], example.currents[t])
-            yield t, (seen.value - seen.matrix @ c) / np.sqrt(seen.noise_variance)
-        return
-    for t in range(0, len(truth), VOLTAGE_STRIDE):
-        computed = task.observation.voltages(truth[t], example.currents[t:t + 1])[0]
-        yield t, (example.voltages[t] - computed) / task.noise.std(computed)
+        seen = map(observe, example.voltages, example.currents)
+        errors = [(each.value - each.matrix @ c) / np.sqrt(each.noise_variance)
+                  for each, c in zip(seen, truth, strict=True)]
+        return np.arange(len(truth)), np.array(errors)
+    steps = np.arange(0, len(truth), VOLTAGE_STRIDE)
+    computed = np.array([task.observation.voltages(truth[t], example.currents[t:t + 1])[0]
+                         for t in steps])
+    return steps, (example.voltages[steps] - computed) / task.noise.std(computed)
 
 
 def inflow_regressors(s: np.ndarray, across: np.ndarray, steps: int, memory: int) -> np.ndarray:

@@ -17,7 +17,7 @@ from eitbench import _check
 from eitbench._files import write_atomically
 from eitbench.estimation.forward import Forward, linearise_at_prediction, linearise_at_reference
 from eitbench.estimation.gaussian import LinearMeasurement
-from eitbench.estimation.inflow_prior import nominal_worlds, source_world
+from eitbench.estimation.inflow_prior import own_world_first
 from eitbench.estimation.inflow_response import ImpulseResponse
 
 if TYPE_CHECKING:
@@ -134,9 +134,7 @@ class IdentifiedModel:
         n_electrodes = self.mean_voltage_error.shape[1]
         if task.mesh.n_nodes != len(self.basis) or task.currents.shape[1] != n_electrodes:
             return False
-        fingerprint = task_fingerprint(task)
-        return fingerprint.shape == self.task_fingerprint.shape and bool(
-            np.allclose(fingerprint, self.task_fingerprint, atol=FINGERPRINT_ATOL))
+        return has_fingerprint(task, self.task_fingerprint)
 
     def save(self, path: Path) -> None:
         """Write a file that `load` reads, in single precision."""
@@ -172,15 +170,18 @@ def task_fingerprint(task: Task) -> np.ndarray:
     return np.concatenate([voltages.ravel() / np.abs(voltages).max(), moved @ x / moved.sum()])
 
 
+def has_fingerprint(task: Task, known: np.ndarray) -> bool:
+    """Return whether `task_fingerprint` of a task agrees with this one, up to rounding."""
+    fingerprint = task_fingerprint(task)
+    return fingerprint.shape == known.shape and np.allclose(fingerprint, known,
+                                                            atol=FINGERPRINT_ATOL)
+
+
 def compatible_models(folder: Path, task: Task) -> list[IdentifiedModel]:
     """Return the models in a folder's files for this task: first the models identified in the
     task's world, then the others, by file name."""
-    models = map(_loaded, sorted(folder.glob("*.npz")))
-    suiting = [model for model in models if model.matches_task(task)]
-    return sorted(suiting, key=lambda model: source_world(model.source) not in
-                  nominal_worlds(task.world))
+    models = map(_load, sorted(folder.glob("*.npz")))
+    return own_world_first(task, [model for model in models if model.matches_task(task)])
 
 
-@lru_cache(maxsize=8)
-def _loaded(path: Path) -> IdentifiedModel:
-    return IdentifiedModel.load(path)
+_load = lru_cache(maxsize=8)(IdentifiedModel.load)

@@ -106,9 +106,13 @@ class InflowPrior:
         """Return c_in/ĉ_bh (..., n_inlet) for u of the same shape."""
         return 1.0 + u if self.link == "linear" else np.exp(u)
 
-    def inverse_link_derivative(self, u: np.ndarray) -> np.ndarray:
-        """Return the derivative of `inverse_link` by u, entry by entry."""
-        return np.ones_like(u) if self.link == "linear" else np.exp(u)
+    def derivative_by_x(self, by_ratio: np.ndarray, x: np.ndarray) -> np.ndarray:
+        """Return derivatives (m, K, r) by x (K, r) from those by c_in/ĉ_bh (m, K, n_inlet)."""
+        if self.link == "logarithm":
+            by_ratio = by_ratio * np.exp(x @ self.modes.T)
+        # one product of two-dimensional arrays is faster than many small products
+        by_x = by_ratio.reshape(-1, len(self.modes)) @ self.modes
+        return by_x.reshape(*by_ratio.shape[:2], -1)
 
     def time_covariance(self, steps: int) -> np.ndarray:
         """Return the covariance (steps,) of an entry of x at lags of 0 … steps − 1 time steps."""
@@ -237,13 +241,21 @@ def compatible_priors(folder: Path, task: Task, link: str) -> list[InflowPrior]:
     have such an inlet and none of them is the task's, a message names the world of the first prior,
     since its inflow may differ from the task's.
     """
-    priors = map(_loaded, sorted(folder.glob("*.json")))
+    priors = map(_load, sorted(folder.glob("*.json")))
     suiting = [prior for prior in priors if prior.link == link and prior.matches_task(task)]
     worlds = {source_world(prior.source) for prior in suiting}
     if len(worlds) > 1 and not worlds & nominal_worlds(task.world):
         _say_other_world(task.world, str(source_world(suiting[0].source)))
-    return sorted(suiting, key=lambda prior: source_world(prior.source) not in
-                  nominal_worlds(task.world))
+    return own_world_first(task, suiting)
+
+
+_load = lru_cache(maxsize=16)(InflowPrior.load)  # once per process: caches can use its identity
+
+
+def own_world_first(task: Task, fitted: list[Any]) -> list[Any]:
+    """Return priors or models, those fitted in the task's world first."""
+    own = nominal_worlds(task.world)
+    return sorted(fitted, key=lambda each: source_world(each.source) not in own)
 
 
 @lru_cache
@@ -258,12 +270,6 @@ def nominal_worlds(name: str) -> set[str]:
     homes = {each.nominal for each in entries().values()
              if each.nominal and each.world.name == name}
     return {name} | {entries()[home].world.name for home in homes}
-
-
-@lru_cache(maxsize=16)
-def _loaded(path: Path) -> InflowPrior:
-    """Load a prior once per process, so that caches can use its identity."""
-    return InflowPrior.load(path)
 
 
 def source_world(source: Mapping[str, Any]) -> str | None:

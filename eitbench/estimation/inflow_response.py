@@ -7,7 +7,7 @@ from functools import lru_cache
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from scipy.linalg import svd, toeplitz
+from scipy.linalg import toeplitz
 
 if TYPE_CHECKING:
     from eitbench.estimation.inflow_prior import InflowPrior
@@ -69,13 +69,18 @@ def reduced_response(response: ImpulseResponse, prior: InflowPrior, modes: int) 
     The directions are the eigenvectors of B Γ_c Bᵀ with Γ_c the covariance of Σ_k W_k E x_{t−k},
     the concentration linearised in x.
     """
-    q, K, _ = response.weights.shape
-    root = np.linalg.cholesky(toeplitz(prior.time_covariance(K)))
-    by_x = response.weights @ prior.modes                                            # (q, K, r)
-    moves = np.tensordot(by_x, root, (1, 0)).reshape(q, -1)
-    directions = svd(moves, full_matrices=False)[0][:, :modes]
+    root = np.linalg.cholesky(toeplitz(prior.time_covariance(response.weights.shape[1])))
+    past = np.moveaxis(response.weights @ prior.modes, 1, 0)                         # (K, q, r)
+    directions = principal_directions(past, root)[:, :modes]
     return ImpulseResponse(response.basis @ directions,
                            np.tensordot(directions.T, response.weights, 1))
+
+
+def principal_directions(past: np.ndarray, root: np.ndarray) -> np.ndarray:
+    """Return the principal directions (q, …) of Σ_k past_k x_{t−k}, in descending order, with
+    ``past`` (K, q, r) and inflows x of covariance root·rootᵀ in time."""
+    moves = np.tensordot(past, root, (0, 0)).reshape(past.shape[1], -1)
+    return np.linalg.svd(moves, full_matrices=False)[0]
 
 
 def one_step_response(transport: Transport) -> np.ndarray:

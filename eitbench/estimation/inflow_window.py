@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.linalg import toeplitz
@@ -19,23 +19,29 @@ if TYPE_CHECKING:
     from eitbench.worlds.task import Task
 
 
-class ArModel(NamedTuple):
-    """Autoregressive model: the next value from the last W values, the newest first."""
-
-    weights: np.ndarray
-    """(W,)"""
-    variance: float
-    """variance of the residual"""
-
-
-def yule_walker(covariance: np.ndarray) -> tuple[np.ndarray, ArModel]:
-    """Return the covariance (W, W) of W values and the regression of the next one (Yule–Walker).
+def yule_walker(covariance: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
+    """Return the covariance (W, W) of W values, the newest first, and of the regression of the next
+    value on them (Yule–Walker) the weights (W,) and the variance of the residual.
 
     ``covariance`` (W + 1,) holds the covariances at lags of 0 … W steps.
     """
     before = toeplitz(covariance[:-1])
     weights = np.linalg.solve(before, covariance[1:])
-    return before, ArModel(weights, float(covariance[0] - weights @ covariance[1:]))
+    return before, weights, float(covariance[0] - weights @ covariance[1:])
+
+
+def window_model(prior: InflowPrior, steps: int,
+                 constants: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return weights (W, d), variances of new values (d,), and covariance (W·d, W·d) of a window of
+    ``steps`` W values of d = r + k numbers: the prior's x (r,), and constants (k,) of variance 1.
+    """
+    before, weights, variance = yule_walker(prior.time_covariance(steps + 1))
+    is_constant = np.repeat([0.0, 1.0], [prior.modes.shape[1], constants])
+    covariance = (np.kron(before, np.diag(1.0 - is_constant))
+                  + np.kron(np.ones_like(before), np.diag(is_constant)))
+    last = np.eye(steps)[:, :1]
+    return (np.where(is_constant, last, weights[:, None]), variance * (1.0 - is_constant),
+            covariance)
 
 
 class InflowWindow(StateSpace):
@@ -46,11 +52,11 @@ class InflowWindow(StateSpace):
 
     Parameters
     ----------
-    transport : Transport
-        Used only for the default of ``responses``.
+    task : Task
     prior : InflowPrior
+        Prior for the task's inlet; ``ValueError`` if it is for another inlet.
     c_ref : float
-        ĉ_bh in mol/m³.
+        ĉ_bh in mol/m³, the concentration in the pipe before the first inflow.
     lag : int
         Lag of the oldest state to be estimated, in time steps.
     responses : sequence of ImpulseResponse, optional
@@ -76,7 +82,7 @@ class InflowWindow(StateSpace):
         """W"""
         self.time = 0
         """t"""
-        before, (weights, variance) = yule_walker(prior.time_covariance(self.window_steps + 1))
+        before, weights, variance = yule_walker(prior.time_covariance(self.window_steps + 1))
         self._prior_covariance = np.kron(before, np.eye(self.n_modes))
         self.ar_model = weights[:, None], np.full(self.n_modes, variance)
         """Weights (W, r) or (W, 1) and variances (r,) of the entries of the next x."""
@@ -124,10 +130,7 @@ class InflowWindow(StateSpace):
 
     def _by_x(self, mean: np.ndarray, by_inflow: np.ndarray, lag: int) -> np.ndarray:
         """Return derivatives (m, K·r) by x from those by the inflows (m, K, n_inlet)."""
-        by_u = by_inflow * (self.c_ref * self.prior.inverse_link_derivative(self._recent(mean, lag)
-                                                          @ self.prior.modes.T))
-        # one product of two-dimensional arrays is faster than many small products
-        by_x = by_u.reshape(-1, by_u.shape[-1]) @ self.prior.modes
+        by_x = self.c_ref * self.prior.derivative_by_x(by_inflow, self._recent(mean, lag))
         return by_x.reshape(len(by_inflow), -1)
 
     def _recent(self, mean: np.ndarray, lag: int) -> np.ndarray:
@@ -137,7 +140,7 @@ class InflowWindow(StateSpace):
 
 
 def shift_window(mean: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """Return the mean (W·d,) of a window one step later, with the weights of an `ArModel`."""
+    """Return the mean (W·d,) of a window one step later, with weights (W, d) or (W, 1)."""
     values = mean.reshape(len(weights), -1)
     return np.concatenate([(weights * values).sum(axis=0)[None], values[:-1]]).ravel()
 

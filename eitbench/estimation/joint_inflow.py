@@ -10,7 +10,7 @@ from eitbench import _check
 from eitbench.estimation.covariance import Covariance, DenseCovariance
 from eitbench.estimation.filter import StateSpace
 from eitbench.estimation.inflow_response import one_step_response
-from eitbench.estimation.inflow_window import shift_window, yule_walker
+from eitbench.estimation.inflow_window import shift_window, window_model
 
 if TYPE_CHECKING:
     from eitbench.estimation.inflow_prior import InflowPrior
@@ -26,16 +26,12 @@ class VelocityInflowWindow(StateSpace):
     propagated column by column. The link between c_in and x is linearised at each measurement
     vector. Contributions older than W steps remain in the mean, without uncertainty.
 
-    θ is projected onto the flow's bounds, without a change of the concentration. ``ValueError``
-    naming the argument if it is out of range, or if the prior is for another inlet.
+    θ is projected onto the flow's bounds, without a change of the concentration.
 
     Parameters
     ----------
-    task : Task
-    prior : InflowPrior
-        Prior for the task's inlet.
-    c_ref : float
-        ĉ_bh in mol/m³.
+    task, prior, c_ref
+        As in `InflowWindow`.
     flow : VelocityPrior
     window_steps : int
         W in time steps; should exceed the residence time.
@@ -50,17 +46,10 @@ class VelocityInflowWindow(StateSpace):
         self.flow = flow
         r = self.n_modes = prior.modes.shape[1]
         k = len(flow.initial)
-        before, (weights, variance) = yule_walker(prior.time_covariance(W + 1))
-        self._weights = np.zeros((W, r + k))
-        self._weights[:, :r] = weights[:, None]
-        self._weights[0, r:] = 1.0
-        self._new_variance = np.concatenate([np.full(r, variance), flow.walk_std**2])
-        covariance = np.zeros((W, r + k, W, r + k))
-        for part in range(r):
-            covariance[:, part, :, part] = before
-        for part in range(k):
-            covariance[:, r + part, :, r + part] = flow.initial_std[part]**2
-        self._covariance = covariance.reshape(W * (r + k), -1)
+        self._weights, self._new_variance, covariance = window_model(prior, W, k)
+        self._new_variance[r:] = flow.walk_std**2
+        std = np.tile(np.append(np.ones(r), flow.initial_std), W)
+        self._covariance = std[:, None] * covariance * std
         self._initialise_window(W, k)
 
     def _initialise_window(self, W: int, k: int) -> None:
@@ -117,11 +106,7 @@ class VelocityInflowWindow(StateSpace):
     def _by_state(self, mean: np.ndarray, parts: np.ndarray) -> np.ndarray:
         """Return derivatives (m, W·(r + k)) by z, from contributions (m, W, n_inlet + k)."""
         m = len(self._inlet)
-        by_u = self.c_ref * self.prior.inverse_link_derivative(self._deviation(mean))
-        by_inflow = parts[:, :, :m] * by_u
-        # one product of two-dimensional arrays is faster than many small products
-        by_x = by_inflow.reshape(-1, m) @ self.prior.modes
-        by_x = by_x.reshape(len(parts), self.window_steps, -1)
+        by_x = self.c_ref * self.prior.derivative_by_x(parts[:, :, :m], self._inflows(mean))
         return np.concatenate([by_x, parts[:, :, m:]], axis=2).reshape(len(parts), -1)
 
     def constrain(self, mean: np.ndarray) -> np.ndarray:
@@ -140,12 +125,13 @@ class VelocityInflowWindow(StateSpace):
     def _theta(self, mean: np.ndarray) -> np.ndarray:
         return mean[self.n_modes:self._weights.shape[1]]
 
-    def _deviation(self, mean: np.ndarray) -> np.ndarray:
-        """Return u (W, n_inlet)."""
-        return mean.reshape(self.window_steps, -1)[:, :self.n_modes] @ self.prior.modes.T
+    def _inflows(self, mean: np.ndarray) -> np.ndarray:
+        """Return x (W, r)."""
+        return mean.reshape(self.window_steps, -1)[:, :self.n_modes]
 
     def _sources(self, mean: np.ndarray) -> np.ndarray:
         """Return c_in in mol/m³ and θ of each step (W, n_inlet + k)."""
-        inflows = self.c_ref * self.prior.inverse_link(self._deviation(mean))
+        deviation = self._inflows(mean) @ self.prior.modes.T
+        inflows = self.c_ref * self.prior.inverse_link(deviation)
         theta = mean.reshape(self.window_steps, -1)[:, self.n_modes:]
         return np.concatenate([inflows, theta], axis=1)

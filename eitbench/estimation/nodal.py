@@ -25,6 +25,7 @@ from eitbench.physics.stationary import StationaryTransport
 if TYPE_CHECKING:
     from eitbench.numerics.mesh import Mesh
     from eitbench.physics.transport import Transport
+    from eitbench.worlds.task import Task
     from eitbench.worlds.world import Prior
 
 FILTER_RANK_TOLERANCE = 1e-4
@@ -84,7 +85,7 @@ class NodalStates(StateSpace):
         """Return Q X of the step to ``time``, for X (n,) or (n, k)."""
         covariance = self._initial[1]
         if isinstance(covariance, LowRankCovariance):
-            return covariance.open_loop.apply_noise(X)
+            return covariance.times_noise(X)
         noise = self.motion(time).noise
         return np.zeros_like(X) if noise is None else noise @ X
 
@@ -210,29 +211,37 @@ def table_5_1_filter(transport: Transport, prior: Prior, c_ref: float, *,
 def _flowing_states(transport: Transport, prior: Prior, c_ref: float,
                     rank_tolerance: float = FILTER_RANK_TOLERANCE) -> NodalStates:
     F, Y, _ = transport.evolution_model()
-    covariance = LowRankCovariance(_open_loop(transport, prior).scale_by(c_ref**2), rank_tolerance)
+    covariance = LowRankCovariance(_open_loop(transport, prior), rank_tolerance, c_ref**2)
     return NodalStates(np.full(len(F), c_ref), covariance, Motion(F, Y.sum(axis=1) * c_ref))
+
+
+def flow_motion(task: Task, transition: tuple[np.ndarray, np.ndarray], c_ref: float) -> Motion:
+    """Return the motion of Table 5.1 in another flow than the task's, by its transport's F and Y.
+
+    The nodal part of the noise is that of the task's flow: it is small, and takes long to compute.
+    """
+    F, Y = transition
+    noise = task.prior.inflow_std**2 * (Y @ Y.T) + nodal_noise(task.transport, task.prior)
+    return Motion(F, c_ref * Y.sum(axis=1), c_ref**2 * noise)
 
 
 def initial_covariance(mesh: Mesh, prior: Prior) -> np.ndarray:
     """Return Γ_{0|0} (n, n) for ĉ_bh = 1: diagonal, or smooth over `Prior.initial_length`."""
     if not prior.initial_length:
         return prior.initial_std**2 * np.eye(mesh.n_nodes)
-    return _smooth(mesh, prior.initial_length, prior.initial_std)
-
-
-@lru_cache(maxsize=4)
-def _smooth(mesh: Mesh, length: float, std: float) -> np.ndarray:
-    from eitbench.numerics.fem import mass_matrix, stiffness_matrix
-    covariance = smoothness_covariance(mass_matrix(mesh), stiffness_matrix(mesh), length, std)
-    covariance.setflags(write=False)
-    return covariance
+    return smoothness_covariance(mesh, prior.initial_length, prior.initial_std)
 
 
 @lru_cache(maxsize=12)
 def _open_loop(transport: Transport, prior: Prior) -> OpenLoopCovariance:
     return OpenLoopCovariance(transport.evolution_model().F, _state_noise(transport, prior),
                               initial_covariance(transport.mesh, prior))
+
+
+@lru_cache(maxsize=4)
+def nodal_noise(transport: Transport, prior: Prior) -> np.ndarray:
+    """Return H Γ_e Hᵀ (n, n) for ĉ_bh = 1."""
+    return transport.evolution_model().state_noise_covariance(0.0, prior.nodal_std**2)
 
 
 @lru_cache(maxsize=4)

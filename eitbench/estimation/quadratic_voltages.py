@@ -111,31 +111,27 @@ class QuadraticVoltageModel:
         return u, self._to_modes @ u, c
 
 
-class ScaledVoltageModel:
+class ScaledVoltageModel(QuadraticVoltageModel):
     """Voltages that are quadratic at any c_ref: 𝓡(c) = e^−ū 𝓖(u), with u = ln(c/c_0), ū its mean
     over the nodes, and 𝓖 = e^ū 𝓡 as in `QuadraticVoltageModel`.
 
-    Without contact impedances, 𝓖 would not depend on ū. It is a `VoltageModel`; arguments and
-    ``ValueError`` as in `QuadraticVoltageModel`.
+    Without contact impedances, 𝓖 would not depend on ū. Arguments and ``ValueError`` as in
+    `QuadraticVoltageModel`; a constant is added to the modes.
     """
 
     def __init__(self, model: TransferResistanceModel, c_ref: float, modes: np.ndarray) -> None:
-        self.c_ref = _check.number("c_ref", c_ref, low=0.0, open_low=True, units="mol/m³")
-        self.smallest = model.min_concentration
         modes = _check.array("modes", modes, (None, None))
         with_level, _ = np.linalg.qr(np.column_stack([np.ones(len(modes)), modes]))
-        self.quadratic = QuadraticVoltageModel(_Scaled(model, c_ref), c_ref, with_level)
+        super().__init__(_Scaled(model, c_ref), c_ref, with_level)
 
     def voltages(self, concentration: np.ndarray, currents: np.ndarray) -> np.ndarray:
-        """Return V (K, L) for currents (K, L) in A (A/m in 2D) and concentration (n,) in mol/m³."""
         c = np.maximum(concentration, self.smallest)
-        return self.quadratic.voltages(c, currents) / _scale(c, self.c_ref)
+        return super().voltages(c, currents) / _scale(c, self.c_ref)
 
     def linearise(self, concentration: np.ndarray,
                   currents: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return voltages (K, L) in V and derivatives by c, (K, L, n) in V·m³/mol."""
         c = np.maximum(concentration, self.smallest)
-        scaled, by_c = self.quadratic.linearise(c, currents)
+        scaled, by_c = super().linearise(c, currents)
         scale = _scale(c, self.c_ref)
         return scaled / scale, (by_c - scaled[..., None] / (len(c) * c)) / scale
 

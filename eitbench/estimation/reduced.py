@@ -105,7 +105,8 @@ class ReducedStates(Protocol):
     """Reduced state space for a batch of B episodes, in the precision of its arrays.
 
     The state has s entries, the concentration q coordinates in a basis. The results of an episode
-    are bit-identical for all compositions of the batch.
+    are bit-identical for all compositions of the batch. Subclasses define the evolution; the other
+    methods have defaults for a state that is the coordinates, without bounds.
     """
 
     basis: np.ndarray
@@ -124,17 +125,20 @@ class ReducedStates(Protocol):
 
     def coordinates(self, mean: np.ndarray) -> np.ndarray:
         """Return the coordinates (B, q) of the concentration."""
+        return mean
 
     def jacobian(self, mean: np.ndarray, matrix: np.ndarray) -> np.ndarray:
         """Return derivatives (B, m, s) by the state from derivatives (B, m, q) or (m, q) by the
         coordinates."""
+        return matrix
 
     def constrain(self, mean: np.ndarray) -> np.ndarray:
         """Return the nearest mean (B, s) within bounds."""
+        return mean
 
 
-class SteadyStates:
-    """State space of a `ReducedModel`, the coordinates of the concentration; a `ReducedStates`."""
+class SteadyStates(ReducedStates):
+    """State space of a `ReducedModel`: the coordinates of the concentration."""
 
     def __init__(self, model: ReducedModel) -> None:
         self.model = model
@@ -162,15 +166,6 @@ class SteadyStates:
 
     def step(self, mean: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         return self.model.transition, self.model.noise, self.model.transition @ mean
-
-    def coordinates(self, mean: np.ndarray) -> np.ndarray:
-        return mean
-
-    def jacobian(self, mean: np.ndarray, matrix: np.ndarray) -> np.ndarray:
-        return matrix
-
-    def constrain(self, mean: np.ndarray) -> np.ndarray:
-        return mean
 
 
 class ReducedFilter:

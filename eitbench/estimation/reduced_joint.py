@@ -12,7 +12,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from eitbench.estimation.reduced import matvec
+from eitbench.estimation.nodal import Motion
+from eitbench.estimation.reduced import ReducedStates, matvec
 
 
 class JointModel(NamedTuple):
@@ -63,8 +64,8 @@ class TransitionSplines:
         return ((c3 * d + c2) * d + c1) * d + c0, slope, ((n3 * d + n2) * d + n1) * d + n0
 
 
-class JointStates:
-    """State space of a `JointModel`: (a, θ), as in `VelocityStates`, θ in m/s; a `ReducedStates`.
+class JointStates(ReducedStates):
+    """State space of a `JointModel`: (a, θ), as in `VelocityStates`, θ in m/s.
 
     Deviations are propagated with [[A, (dA/dθ) a], [0, 1]].
 
@@ -134,12 +135,12 @@ def _moved(transition: np.ndarray, mean: np.ndarray) -> np.ndarray:
 
 
 def joint_model(basis: np.ndarray, mass: np.ndarray, initial: np.ndarray, velocities: np.ndarray,
-                steps: Iterable[tuple[np.ndarray, np.ndarray]]) -> JointModel:
+                motions: Iterable[Motion]) -> JointModel:
     """Project F(θ) and Γ_w(θ), (n, n) at each of ``velocities``, onto ``basis`` (Galerkin)."""
     weighted = mass @ basis
     transition = []
     noise = []
-    for F, state_noise in steps:                           # one at a time, to save memory
+    for F, _, state_noise in motions:                      # one at a time, to save memory
         transition.append(weighted.T @ (F @ basis))
         noise.append(weighted.T @ (state_noise @ weighted))
     return JointModel(basis, np.asarray(velocities, dtype=float), np.array(transition),

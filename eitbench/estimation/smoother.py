@@ -21,7 +21,7 @@ def fixed_interval_smoother(start: Filter,
     ``start`` must have a `LowRankCovariance` and a time-invariant motion.
     """
     steps = kalman_filter(start, observations)
-    return [_smoothed(step, adjoint) for step, adjoint in _backwards(start, steps)][::-1]
+    return [_smoothed(step, adjoint) for step, adjoint in _adjoints(start, steps)][::-1]
 
 
 def smooth_state(filter_: Filter, steps: Sequence[Step]) -> Estimate:
@@ -29,63 +29,55 @@ def smooth_state(filter_: Filter, steps: Sequence[Step]) -> Estimate:
 
     With the last k + 1 steps of ``filter_`` this is the fixed-lag smoother c_{t−k|t}.
     """
-    *_, (step, adjoint) = _backwards(filter_, steps)
+    *_, (step, adjoint) = _adjoints(filter_, steps)
     return _smoothed(step, adjoint)
 
 
 def smooth_means(start: Filter, observations: Iterable[LinearMeasurement]) -> np.ndarray:
     """Return the means c_{t|T} (T, n) of a filter of `NodalStates` with any motion.
 
-    The adjoint λ_t = Hᵀ S⁻¹ ν + (I − K H)ᵀ Fᵀ_{t+1} λ_{t+1} is computed backwards, and the smoothed
-    state forwards, from c_{0|T} = c_{0|0} + Γ_{0|0} F₁ᵀ λ_1 by c_t = F_t c_{t−1} + s_t + Γ_w λ_t
-    (``docs/methods.md``, 6). No variances are computed and no covariances stored.
+    The smoothed state follows forwards from the adjoints λ: c_{0|T} = c_{0|0} + Γ_{0|0} F₁ᵀ λ_1 and
+    c_t = F_t c_{t−1} + s_t + Γ_w λ_t (``docs/methods.md``, 6). No variances are computed and no
+    covariances stored.
     """
     assert isinstance(start.space, NodalStates)
     space = start.space
     state, initial = space.initial()
     steps = kalman_filter(start, observations)
-    adjoints = np.empty((len(steps), len(state)))
-    later = np.zeros_like(state)
-    for k, step in reversed(list(enumerate(steps))):
-        factor = cho_factor(step.innovation_covariance, lower=True)
-        adjoints[k] = _before(step, factor, later) + step.matrix.T @ cho_solve(factor,
-                                                                               step.innovation)
-        later = space.transition_matrix(step.time).T @ adjoints[k]
-    state = state + initial.times(later[:, None])[:, 0]
-    smoothed = np.empty_like(adjoints)
-    for k, step in enumerate(steps):
+    adjoints = [adjoint for _, adjoint in _adjoints(start, steps, means_only=True)][::-1]
+    state = state + initial.times(space.transition_matrix(steps[0].time).T @ adjoints[0])[:, 0]
+    smoothed = np.empty((len(steps), len(state)))
+    for k, (step, adjoint) in enumerate(zip(steps, adjoints, strict=True)):
         motion = space.motion(step.time)
         state = smoothed[k] = (motion.apply(state) + motion.forcing
-                               + space.noise_times(step.time, adjoints[k]))
+                               + space.noise_times(step.time, adjoint[:, 0]))
     return smoothed
 
 
-def _backwards(filter_: Filter, steps: Sequence[Step]) -> Iterator[tuple[Step, np.ndarray]]:
+def _adjoints(filter_: Filter, steps: Sequence[Step], *,
+              means_only: bool = False) -> Iterator[tuple[Step, np.ndarray]]:
     """Yield (step, [λ, B]) from the last step to the first, from data of this and later steps.
 
     The adjoint λ and the information N = B Bᵀ satisfy, with S = L Lᵀ,
         λ_t = Hᵀ S⁻¹ ν + (I − K H)ᵀ Fᵀ λ_{t+1},        B_t = [Hᵀ L⁻ᵀ, (I − K H)ᵀ Fᵀ B_{t+1}].
-    B is truncated to its numerical rank like the filter's Z.
+    B is truncated to its numerical rank like the filter's Z; with ``means_only`` it is empty.
     """
     assert isinstance(filter_.space, NodalStates)
-    assert isinstance(filter_.covariance, LowRankCovariance)
-    later = np.zeros((len(filter_.mean), 1))
+    later = np.zeros((len(steps[0].mean), 1))
     for step in reversed(steps):
         factor = cho_factor(step.innovation_covariance, lower=True)
+        H = step.matrix
         if step is not steps[-1]:
-            F = filter_.space.transition_matrix(step.time + 1)
-            later = _before(step, factor, F.T @ later)
-        adjoint = later[:, 0] + step.matrix.T @ cho_solve(factor, step.innovation)
-        information = solve_triangular(factor[0], step.matrix, lower=True).T
-        information = truncate_columns(np.hstack([later[:, 1:], information]),
-                                       filter_.covariance.rank_tolerance)
-        later = np.column_stack([adjoint, information])
+            later = filter_.space.transition_matrix(step.time + 1).T @ later
+            later = later - H.T @ cho_solve(factor, step.cross_covariance.T @ later)
+        later[:, 0] += H.T @ cho_solve(factor, step.innovation)
+        if not means_only:
+            assert isinstance(filter_.covariance, LowRankCovariance)
+            information = solve_triangular(factor[0], H, lower=True).T
+            information = truncate_columns(np.hstack([later[:, 1:], information]),
+                                           filter_.covariance.rank_tolerance)
+            later = np.column_stack([later[:, 0], information])
         yield step, later
-
-
-def _before(step: Step, factor: tuple[np.ndarray, bool], X: np.ndarray) -> np.ndarray:
-    """Return (I − K H)ᵀ X for X (n,) or (n, k)."""
-    return X - step.matrix.T @ cho_solve(factor, step.cross_covariance.T @ X)
 
 
 def _smoothed(step: Step, adjoint: np.ndarray) -> Estimate:

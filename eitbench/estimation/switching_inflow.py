@@ -15,7 +15,7 @@ from eitbench.estimation.covariance import DenseCovariance
 from eitbench.estimation.filter import Filter, Step
 from eitbench.estimation.forward import Forward
 from eitbench.estimation.gaussian import LinearMeasurement
-from eitbench.estimation.inflow_window import InflowWindow, yule_walker
+from eitbench.estimation.inflow_window import InflowWindow, window_model
 from eitbench.worlds.task import Estimate
 
 if TYPE_CHECKING:
@@ -37,11 +37,8 @@ class SwitchingInflowFilter:
 
     Parameters
     ----------
-    task : Task
-    prior : InflowPrior
-        Prior for the task's inlet with `Regimes`; ``ValueError`` otherwise.
-    c_ref : float
-        ĉ_bh in mol/m³.
+    task, prior, c_ref
+        As in `InflowWindow`; ``ValueError`` if the prior has no `Regimes`.
     level_std : float
         Standard deviation of the background between slugs, relative to ĉ_bh, > 0.
     forward : callable
@@ -63,21 +60,16 @@ class SwitchingInflowFilter:
         """(2,) probabilities of the present regime: quiet, slug"""
         self._transitions = np.array([[1.0 - regimes.p_onset, regimes.p_onset],
                                       [regimes.p_end, 1.0 - regimes.p_end]])
-        r = modes.shape[1]
         W = spaces[0].window_steps
-        before, (weights, variance) = yule_walker(prior.time_covariance(W + 1))
-        quiet = np.zeros((W, r))
-        quiet[0, -1] = 1.0
-        slug = quiet.copy()
-        slug[:, :-1] = weights[:, None]
-        stays = np.eye(r)[-1]
-        leaves = 1.0 - stays
-        spaces[0].ar_model = quiet, regimes.quiet_variance_ratio * leaves
-        spaces[1].ar_model = slug, variance * leaves
+        slug, variance, covariance = window_model(prior, W, 1)
+        is_inflow = np.repeat([True, False], [prior.modes.shape[1], 1])
+        quiet = np.where(is_inflow, 0.0, slug)
+        spaces[0].ar_model = quiet, regimes.quiet_variance_ratio * is_inflow
+        spaces[1].ar_model = slug, variance
+        std = np.tile(np.where(is_inflow, np.sqrt(regimes.variance), 1.0), W)
+        covariance = std[:, None] * covariance * std
         self.filters = [Filter(space) for space in spaces]
         """filters of the regimes: quiet, slug"""
-        covariance = np.kron(regimes.variance * before, np.diag(leaves))
-        covariance += np.kron(np.ones((W, W)), np.diag(stays))
         for each in self.filters:
             each.covariance = DenseCovariance(covariance)
         self._forward = forward

@@ -13,7 +13,7 @@ from eitbench import _check
 from eitbench.estimation.covariance import Covariance, DenseCovariance
 from eitbench.estimation.filter import StateSpace
 from eitbench.estimation.inflow_response import one_step_response
-from eitbench.estimation.nodal import initial_covariance
+from eitbench.estimation.nodal import initial_covariance, nodal_noise
 
 if TYPE_CHECKING:
     from eitbench.physics.transport import ConvectionDiffusion, VelocityField
@@ -159,10 +159,10 @@ def velocity_states(task: Task, c_ref: float, bounds: tuple[float, float]) -> Ve
     `VelocityPrior`.
     """
     prior = task.prior
-    nodal = task.evolution.state_noise_covariance(0.0, (prior.nodal_std * c_ref)**2)
     return VelocityStates(task_velocity_prior(task, bounds), np.full(task.mesh.n_nodes, c_ref),
                           c_ref**2 * initial_covariance(task.mesh, prior), inflow=c_ref,
-                          inflow_std=prior.inflow_std * c_ref, nodal_noise=nodal)
+                          inflow_std=prior.inflow_std * c_ref,
+                          nodal_noise=c_ref**2 * nodal_noise(task.transport, prior))
 
 
 def task_velocity_prior(task: Task, bounds: tuple[float, float] = (0.05, 4.0)) -> VelocityPrior:

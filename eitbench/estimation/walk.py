@@ -32,9 +32,7 @@ def matern_modes(mesh: Mesh, length: float) -> np.ndarray:
     """Return modes (n, K) of a Matérn field of mean variance 1 and correlation ``length`` in m: the
     field is their sum with independent standard normal weights. The array is cached and read-only.
     """
-    from eitbench.numerics.fem import mass_matrix, stiffness_matrix
-    covariance = smoothness_covariance(mass_matrix(mesh), stiffness_matrix(mesh), length, 1.0)
-    values, vectors = np.linalg.eigh(covariance)
+    values, vectors = np.linalg.eigh(smoothness_covariance(mesh, length, 1.0))
     kept = values > MODE_VARIANCE_CUTOFF * values[-1]
     modes: np.ndarray = vectors[:, kept] * np.sqrt(values[kept])
     modes.flags.writeable = False
@@ -78,13 +76,10 @@ class RandomWalk:
         shares = np.asarray(mass_matrix(self.mesh).sum(axis=0)).ravel()
         return shares / shares.sum()
 
-    @cached_property
+    @property
     def covariance(self) -> np.ndarray:
         """(n, n) covariance of e, scaled to mean variance 1."""
-        # lazy import: reading estimates does not need finite elements
-        from eitbench.numerics.fem import mass_matrix, stiffness_matrix
-        return smoothness_covariance(mass_matrix(self.mesh), stiffness_matrix(self.mesh),
-                                     self.length, 1.0)
+        return smoothness_covariance(self.mesh, self.length, 1.0)
 
     def evolution_model(self) -> EvolutionModel:
         """Return F, an empty Y and H, where H Hᵀ is `covariance`."""

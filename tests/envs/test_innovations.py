@@ -77,7 +77,7 @@ def nis_of(random, noise: float) -> float:
     env = make("reduced").unwrapped
     world, rules, B = env.world, env.rules, 32
     shared = SharedData.of(rules)
-    model, level = shared.states.model, shared.voltages._level(0)
+    model, level = shared.states.model, shared._level(0)
     root, initial = (vectors * np.sqrt(np.maximum(values, 0.0)) for values, vectors in (
         np.linalg.eigh(model.noise), np.linalg.eigh(model.initial)))
     state = random.standard_normal((B, len(root))) @ initial.T

@@ -182,6 +182,27 @@ def tiny_task():
     return make_task(TINY)
 
 
+def window_law(space):
+    """Return the evolution of an `InflowWindow` as a linear model of its state."""
+    weights, variances = space.ar_model
+    d, size = space.n_modes, space.window_steps * space.n_modes
+    F, Q = np.eye(size, k=-d), np.zeros((size, size))
+    F[:d] = np.concatenate([np.diag(row) for row in np.broadcast_to(weights, (space.window_steps, d))], axis=1)
+    Q[:d, :d] = np.diag(variances)
+    return LinearGaussian(F, np.zeros(size), Q, np.zeros(size), space.initial()[1].array)
+
+
+def by_window(space, c_ref):
+    """Return the derivatives (n, K·r) of the concentration by the last inflows, for a linear prior."""
+    basis, weights = space.response()
+    return c_ref * basis @ (weights @ space.prior.modes).reshape(len(weights), -1)
+
+
+def theta_of(filter_):
+    """Return the present velocity parameters and their variances."""
+    return filter_.space.velocity(filter_.mean, filter_.covariance)
+
+
 def white_inflow(task):
     """Return the prior of Table 5.1: all nodes and steps are independent."""
     points = task.mesh.points[task.transport.inlet]

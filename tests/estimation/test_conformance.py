@@ -20,15 +20,14 @@ from eitbench.estimation import (
     modal_states,
     smooth_means,
     smooth_state,
-    steady_response,
 )
-from eitbench.estimation.inflow_window import yule_walker
 from eitbench.estimation.walk import matern32_transition
 from eitbench.worlds.task import make_task
 from models import (
     MESH,
     Gaussian,
     LinearGaussian,
+    by_window,
     coarse_transport,
     dense_filter,
     directions,
@@ -39,7 +38,9 @@ from models import (
     rauch_tung_striebel,
     shapes,
     stacked,
+    theta_of,
     two_modes,
+    window_law,
 )
 
 from tiny_worlds import TINY
@@ -98,21 +99,9 @@ def coarse_task():
     return replace(make_task(TINY), transport=coarse_transport(THETA, 1e-2))
 
 
-def window_model(weights, variances, before):
-    """Return a window of values, the newest first, as a linear model."""
-    W, d = weights.shape
-    F, Q = np.eye(W * d, k=-d), np.zeros((W * d, W * d))
-    F[:d] = np.concatenate([np.diag(row) for row in weights], axis=1)
-    Q[:d, :d] = np.diag(variances)
-    return LinearGaussian(F, np.zeros(W * d), Q, np.zeros(W * d), before)
-
-
 def inflow_window():
-    task, prior = coarse_task(), two_modes(MESH.points[:7], link="linear")
-    space = InflowWindow(task, prior, LEVEL, lag=T)
-    before, (weights, variance) = yule_walker(prior.time_covariance(space.window_steps + 1))
-    model = window_model(np.repeat(weights[:, None], 2, axis=1), np.full(2, variance), np.kron(before, np.eye(2)))
-    return Filter(space), [model] * T
+    space = InflowWindow(coarse_task(), two_modes(MESH.points[:7], link="linear"), LEVEL, lag=T)
+    return Filter(space), [window_law(space)] * T
 
 
 def known_flow(k=2):
@@ -278,9 +267,7 @@ def test_a_window_is_its_own_smoother():
     seen, of_state = measured(filter_, models)
     posterior = stacked(models, of_state)[-1]
     run(filter_, seen)
-    space = filter_.space
-    basis, weights = space.response()
-    by_x = LEVEL * basis @ (weights @ space.prior.modes).reshape(len(weights), -1)
+    by_x = by_window(filter_.space, LEVEL)
     for lag in range(T):
         here = slice(2 * lag, 2 * lag + by_x.shape[1])
         estimate = filter_.estimate(lag)
@@ -298,7 +285,7 @@ def test_windows_with_a_known_velocity_are_the_inflow_window():
         run(each, seen)
     off = np.linalg.norm(filter_.concentration - other.concentration)
     assert off < 0.02 * np.linalg.norm(other.concentration - LEVEL)
-    theta, variance = filter_.space.velocity(filter_.mean, filter_.covariance)
+    theta, variance = theta_of(filter_)
     np.testing.assert_array_equal(theta, THETA)
     assert not variance.any()
 
@@ -348,8 +335,3 @@ def test_several_blocks_of_a_dense_covariance():
                 filter_.update(observation)
                 np.testing.assert_array_equal(filter_.covariance.array, filter_.covariance.array.T)
                 assert_state(filter_, Gaussian(now.mean, now.covariance), 1e-10)
-
-
-def test_response_of_a_window_is_the_tasks_flow():
-    space = InflowWindow(coarse_task(), two_modes(MESH.points[:7]), LEVEL)
-    assert space.response_steps == steady_response(coarse_transport(THETA, 1e-2)).weights.shape[1]

@@ -15,25 +15,16 @@ from eitbench.estimation import (
     inflow_response,
     linearise_at_prediction,
 )
-from eitbench.numerics.mesh import rectangle_mesh
-from eitbench.physics.transport import ConvectionDiffusion
 from eitbench.worlds.task import make_task
-from models import averages, two_modes
+from models import MESH, averages, coarse_transport, directions, shapes, two_modes
 
 from tiny_worlds import TINY
 
-R, LEVEL = 0.05, 29.0
-MESH = rectangle_mesh(np.linspace(0.0, 0.4, 17), np.linspace(-R, R, 5))
-"""85 nodes, five at the inlet."""
-
-
-def parabola(points):
-    return np.column_stack([1.5 * (1 - (points[:, 1] / R)**2), np.zeros(len(points))])
+LEVEL = 29.0
 
 
 def transport_at(theta):
-    return ConvectionDiffusion(MESH, lambda points: theta[0] * parabola(points), 1e-2, 5e-3, substeps=4,
-                               inlet=np.arange(5))
+    return coarse_transport(theta, 1e-2)
 
 
 @lru_cache(maxsize=1)
@@ -42,12 +33,12 @@ def task():
 
 
 def prior(link):
-    return two_modes(MESH.points[:5], link=link)
+    return two_modes(MESH.points[:7], link=link)
 
 
 def ensemble(link="logarithm", members=40, std=0.5, spin_up_steps=24):
-    flow = VelocityPrior(transport_at, [parabola], np.array([4.5]), np.array([std]), np.array([0.1 * std]),
-                       np.ones((1, 1)))
+    flow = VelocityPrior(transport_at, directions(1), np.array([4.5]), np.array([std]), np.array([0.1 * std]),
+                         shapes(1))
     return EnsembleFilter(task(), prior(link), LEVEL, flow, members, spin_up_steps, np.random.default_rng(0),
                           linearise_at_prediction(task()))
 

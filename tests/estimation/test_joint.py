@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from eitbench.estimation import Filter, LinearMeasurement, VelocityPrior, VelocityStates
-from models import MESH, averages, coarse_transport, directions, shapes
+from models import MESH, averages, coarse_transport, directions, shapes, theta_of
 
 C_BH, N = 30.0, 147
 NOMINAL, STD = np.array([4.5, 0.0, 0.0]), np.array([1.0, 2.0, 0.5])
@@ -30,11 +30,6 @@ def joint_filter(k=1, **changes):
     flow = VelocityPrior(transport_at, directions(k), *(given.pop(name) for name in (
         "start", "start_std", "walk_std", "profiles", "bounds")))
     return Filter(VelocityStates(flow, **given))
-
-
-def theta_of(filter_):
-    """Return the present parameters and their variances."""
-    return filter_.space.velocity(filter_.mean, filter_.covariance)
 
 
 def sensors(rng, m=16):

@@ -17,7 +17,7 @@ from eitbench.estimation import (
 )
 from eitbench.worlds.catalogue import PIPE_2D_SKEWED, STATIONARY_TANK_2D
 from eitbench.worlds.task import make_task
-from models import MESH, averages, coarse_transport, directions, shapes, two_modes, white_inflow
+from models import MESH, averages, coarse_transport, directions, shapes, theta_of, two_modes, white_inflow
 
 from tiny_worlds import TINY
 
@@ -38,11 +38,6 @@ def flow(std=(1.0, 2.0), walk=(0.05, 0.02)):
 
 def started(belief, window, law=None):
     return Filter(VelocityInflowWindow(task(), law or prior(), LEVEL, belief, window))
-
-
-def theta_of(filter_):
-    """Return the present parameters and their variances."""
-    return filter_.space.velocity(filter_.mean, filter_.covariance)
 
 
 @lru_cache(maxsize=1)

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from eitbench.estimation import Motion
 from eitbench.estimation.reduced import ReducedFilter
 from eitbench.estimation.reduced_joint import JointStates, TransitionSplines, joint_model
 
@@ -20,7 +21,8 @@ def model():
         powers = (theta / 5)**np.arange(4)
         return np.tensordot(powers, parts, 1), np.tensordot(powers, roots @ np.swapaxes(roots, 1, 2), 1)
 
-    return joint_model(basis, mass, np.eye(8), velocities, map(step, velocities)), basis, mass, step
+    motions = (Motion(F, noise=noise) for F, noise in map(step, velocities))
+    return joint_model(basis, mass, np.eye(8), velocities, motions), basis, mass, step
 
 
 def test_tables_equal_the_galerkin_projection(model):

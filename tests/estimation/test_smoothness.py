@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from eitbench.estimation import LinearisedForwardModel, nodal_filter, smoothness_covariance
-from eitbench.numerics.fem import mass_matrix, stiffness_matrix
+from eitbench.numerics.fem import mass_matrix
 from eitbench.numerics.mesh import rectangle_mesh
 from eitbench.numerics.round_meshes import uniform_disc
 from eitbench.worlds.bodies import disc_indicator
@@ -20,11 +20,9 @@ LENGTH, STD = 0.1, 2.0
 
 @pytest.fixture(scope="module")
 def square():
-    """Return mesh, M and Γ for a unit square of 1,681 nodes with a correlation length of 0.1."""
+    """Return mesh and Γ for a unit square of 1,681 nodes with a correlation length of 0.1."""
     mesh = rectangle_mesh(np.linspace(0.0, 1.0, 41), np.linspace(0.0, 1.0, 41))
-    mass = mass_matrix(mesh)
-    covariance = smoothness_covariance(mass, stiffness_matrix(mesh), LENGTH, STD)
-    return SimpleNamespace(mesh=mesh, mass=mass, covariance=covariance)
+    return SimpleNamespace(mesh=mesh, covariance=smoothness_covariance(mesh, LENGTH, STD))
 
 
 def node_at(mesh, x, y):
@@ -43,9 +41,8 @@ def test_covariance_is_symmetric_and_positive_definite(square):
 def test_mean_variance_equals_the_argument(std):
     """∫ Γ(x, x) dx over the area is std², on a mesh of non-uniform cells."""
     mesh = uniform_disc(0.14, 12)
-    mass = mass_matrix(mesh)
-    covariance = smoothness_covariance(mass, stiffness_matrix(mesh), 0.03, std)
-    weights = np.asarray(mass.sum(axis=0)).ravel()
+    covariance = smoothness_covariance(mesh, 0.03, std)
+    weights = np.asarray(mass_matrix(mesh).sum(axis=0)).ravel()
     assert weights @ covariance.diagonal() / weights.sum() == pytest.approx(std**2, rel=1e-12)
     # the variance is larger near the wall
     assert np.ptp(covariance.diagonal()) > 0.5 * std**2
@@ -78,9 +75,8 @@ def test_walls_mirror_the_field(square):
 ])
 def test_errors_name_the_argument(length, std, message):
     """Length and standard deviation must be positive."""
-    mesh = uniform_disc(0.14, 2)
     with pytest.raises(ValueError, match=message):
-        smoothness_covariance(mass_matrix(mesh), stiffness_matrix(mesh), length, std)
+        smoothness_covariance(uniform_disc(0.14, 2), length, std)
 
 
 C_BH = 32.0
@@ -112,9 +108,7 @@ def filtered(order):
 def prior():
     """Return Γ computed from the task's mesh and parameters."""
     task, _ = frame()
-    return smoothness_covariance(mass_matrix(task.mesh), stiffness_matrix(task.mesh),
-                                 task.prior.initial_length,
-                                 C_BH * task.prior.initial_std)
+    return smoothness_covariance(task.mesh, task.prior.initial_length, C_BH * task.prior.initial_std)
 
 
 def linear_model():

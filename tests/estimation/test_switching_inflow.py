@@ -16,8 +16,8 @@ from eitbench.estimation import (
     linearise_at_prediction,
 )
 from eitbench.estimation.switching_inflow import resample
+from models import by_window, two_modes, window_law
 from models import tiny_task as task
-from models import two_modes
 from scipy.stats import multivariate_normal
 
 LEVEL = 29.0
@@ -50,27 +50,16 @@ def enumerated(filter_, regimes, measured):
     textbook Kalman filter for every regime sequence, weighted by prior and likelihood."""
     quiet, _ = filter_.filters
     space = quiet.space
-    W, r = space.window_steps, space.n_modes
-    basis, weights = space.response()
-    # (n, W·r) concentration by the window, from the response's columns
-    G = LEVEL * basis @ np.tensordot(weights, space.prior.modes, 1).reshape(len(weights), -1)
-    G = np.concatenate([G, np.zeros((len(G), (W - weights.shape[1]) * r))], axis=1)
-    steps = []
-    for move, variance in (each.space.ar_model for each in filter_.filters):
-        A = np.eye(W * r, k=-r)
-        A[:r] = np.concatenate([np.diag(row) for row in np.broadcast_to(move, (W, r))], axis=1)
-        Q = np.zeros((W * r, W * r))
-        Q[:r, :r] = np.diag(variance)
-        steps.append((A, Q))
+    G = by_window(space, LEVEL)
+    laws = [window_law(each.space) for each in filter_.filters]
     chain = [[1 - regimes.p_onset, regimes.p_onset], [regimes.p_end, 1 - regimes.p_end]]
     start = [1 - regimes.share, regimes.share]
     found = []
     for sequence in itertools.product([0, 1], repeat=len(measured) + 1):
         log = np.log(start[sequence[0]])
-        m, P = np.zeros(W * r), quiet.covariance.array
+        m, P = np.zeros(G.shape[1]), quiet.covariance.array
         for before, now, seen in zip(sequence, sequence[1:], measured, strict=False):
-            A, Q = steps[now]
-            m, P = A @ m, A @ P @ A.T + Q
+            m, P = laws[now].F @ m, laws[now].F @ P @ laws[now].F.T + laws[now].Q
             H = seen.matrix @ G
             S = H @ P @ H.T + np.diag(seen.noise_variance)
             expected = seen.matrix @ np.full(len(G), LEVEL) + H @ m

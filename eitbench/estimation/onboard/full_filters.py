@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from eitbench.data.episode_cache import score_mass, step_error
-from eitbench.estimation.filter import Filter, StateSpace
+from eitbench.estimation.filter import Filter, StateSpace, Step
 from eitbench.estimation.gaussian import LinearMeasurement
 from eitbench.estimation.inflow_window import InflowWindow
 from eitbench.estimation.nodal import nodal_states
+from eitbench.estimation.onboard.episode_filters import EpisodeFilters, Innovation
 from eitbench.estimation.onboard.inflow_states import fit_world_prior
-from eitbench.estimation.onboard.innovation import Innovation
 from eitbench.estimation.onboard.linearisation import linearisation_table, std_from_variance
 from eitbench.estimation.velocity import velocity_states
 
@@ -26,24 +26,18 @@ VELOCITY_BOUNDS = (1 / 3, 2.0)
 so that a table of few velocities serves the reduced filter."""
 
 
-class FullFilters:
+class FullFilters(EpisodeFilters):
     """Filters of the built-in methods for B episodes; the state is relative to c_ref.
 
     With a white inflow, voltages are linearised about c_ref of the first frame, and an unknown
     velocity is part of the state. With a learned inflow, they are linearised about each prediction.
-    See `EpisodeFilters`.
     """
 
-    def __init__(self, rules: Rules, frames: np.ndarray) -> None:
-        self._rules = rules
-        self._table = linearisation_table(rules.world)
-        self._indices = self._table.nearest_indices(frames, rules.gate)
-        self.c_ref = np.array([self._table.c_ref(k) for k in self._indices])
+    def _start(self, episodes: int) -> None:
+        rules = self._rules
         space = state_space(rules.world.fault_free, rules.inflow)
-        self._filters = [Filter(space, gate=rules.gate) for _ in frames]
-        self._last: list[tuple[np.ndarray, ...] | None] = []
-        for k, currents in enumerate(rules.world.currents):
-            self.assimilate(frames[:, k], np.repeat(currents[None], len(frames), axis=0))
+        self._filters = [Filter(space, gate=rules.gate) for _ in range(episodes)]
+        self._last: list[Step | None] = [None] * episodes
 
     def assimilate(self, voltages: np.ndarray,
                    currents: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -52,34 +46,33 @@ class FullFilters:
         self._last = [None] * len(voltages)
         for b, filter_ in enumerate(self._filters):
             filter_.predict()
-            if not currents[b].any():
-                continue
-            predicted, std, matrix, about = self._linearise(b, currents[b])
-            value = (voltages[b] - predicted) / std + matrix @ about
-            step = filter_.update(LinearMeasurement(matrix, value, np.ones(len(value))))
-            accepted[b] = step.accepted
-            innovations[b] = step.innovation / np.sqrt(step.innovation_covariance.diagonal())
-            self._last[b] = step.innovation, step.innovation_covariance, std, accepted[b]
+            if currents[b].any():
+                step = filter_.update(self._measurement(b, voltages[b], currents[b]))
+                self._last[b] = step
+                accepted[b] = step.accepted
+                innovations[b] = step.innovation / np.sqrt(step.innovation_covariance.diagonal())
         return innovations, accepted
 
-    def _linearise(self, b: int, currents: np.ndarray) -> tuple[np.ndarray, ...]:
-        """Return voltages (L,), their noise (L,) and derivatives (L, n) divided by it, about a
-        relative concentration (n,)."""
-        noise_floor = self._rules.instrument.noise_floor
+    def _measurement(self, b: int, voltages: np.ndarray, currents: np.ndarray) -> LinearMeasurement:
+        """Return the measurement (L,) of the relative concentration (n,) of an episode."""
+        c_ref = self.c_ref[b]
         if self._rules.inflow == "white":
             linearisation = self._table.linearisation(self._indices[b])
-            predicted = currents @ linearisation.resistance
-            std = self._table.noise_std(predicted, noise_floor)
-            matrix = linearisation.by_state(currents) / std[:, None]
-            return predicted, std, matrix, np.ones(matrix.shape[1])
-        about = self._filters[b].concentration
-        c = self.c_ref[b]
-        voltages, by_c = self._table.task.observation.linearise(c * about, currents[None])
-        std = self._table.noise_std(voltages[0], noise_floor)
-        return voltages[0], std, c * by_c[0] / std[:, None], about
+            computed = currents @ linearisation.resistance
+            matrix = linearisation.by_state(currents)
+            about = np.ones(matrix.shape[1])
+        else:
+            about = self._filters[b].concentration
+            (computed,), (by_c,) = self._table.task.observation.linearise(c_ref * about,
+                                                                          currents[None])
+            matrix = c_ref * by_c
+        std = self._table.noise_std(computed, self._rules.instrument.noise_floor)
+        return LinearMeasurement(matrix, voltages - computed + matrix @ about, std**2)
 
     def innovations(self) -> list[Innovation | None]:
-        return [None if last is None else Innovation.of(*last) for last in self._last]
+        return [None if step is None else
+                Innovation.of(step.innovation, step.innovation_covariance, step.accepted)
+                for step in self._last]
 
     def coarse_grid(self) -> tuple[np.ndarray, np.ndarray]:
         # One product per episode: the bits of a joint product depend on the number of episodes.

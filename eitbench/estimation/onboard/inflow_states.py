@@ -19,9 +19,9 @@ from scipy.linalg import toeplitz
 from eitbench._notice import notify
 from eitbench.data.seeds import SPLITS
 from eitbench.estimation.inflow_prior import InflowPrior, fit_prior_from_episodes
-from eitbench.estimation.inflow_response import ImpulseResponse
+from eitbench.estimation.inflow_response import ImpulseResponse, principal_directions
 from eitbench.estimation.inflow_window import yule_walker
-from eitbench.estimation.reduced import matvec
+from eitbench.estimation.reduced import ReducedStates, matvec
 
 if TYPE_CHECKING:
     from eitbench.worlds.world import World
@@ -63,15 +63,15 @@ def inflow_model(response: ImpulseResponse, prior: InflowPrior) -> InflowModel:
     D = min(N_RECENT_INFLOWS, K - 1)
     past = np.moveaxis(response.weights @ prior.modes, 1, 0)                        # (K, Q, r)
     root = np.linalg.cholesky(toeplitz(prior.time_covariance(K)) + 1e-9 * np.eye(K))
-    older = _directions(past[D:], root[:K - D, :K - D])[:, :N_OLDER_COORDINATES]
+    older = principal_directions(past[D:], root[:K - D, :K - D])[:, :N_OLDER_COORDINATES]
     rest = past[:D] - older @ (older.T @ past[:D])
-    recent = _directions(rest, root[:D, :D])[:, :LEARNED_INFLOW_RANK - older.shape[1]]
+    recent = principal_directions(rest, root[:D, :D])[:, :LEARNED_INFLOW_RANK - older.shape[1]]
     directions = np.concatenate([older, recent], axis=1)
     aged = older.T @ past[D:]                                                       # (K − D, h, r)
     before, after = (np.concatenate(list(part), axis=1) for part in (aged[:-1], aged[1:]))
     transition = np.linalg.lstsq(before.T, after.T, rcond=1e-5)[0].T
     weights = np.tensordot(directions.T, response.weights[:, :D + 1], 1)
-    _, (regression, remainder) = yule_walker(prior.time_covariance(D + 1))
+    _, regression, remainder = yule_walker(prior.time_covariance(D + 1))
     r = prior.modes.shape[1]
     by_x = np.zeros((older.shape[1] + D * r, K * r))          # derivatives of the state by past x
     by_x[:older.shape[1], D * r:] = np.moveaxis(aged, 0, 1).reshape(older.shape[1], -1)
@@ -100,16 +100,8 @@ def sample_coordinates(model: InflowModel, response: ImpulseResponse, prior: Inf
     return np.asarray(in_response @ (response.basis.T @ model.basis))
 
 
-def _directions(past: np.ndarray, root: np.ndarray) -> np.ndarray:
-    """Return the principal directions (Q, …) of Σ_k past_k x_{t−k}, in descending order, for
-    inflows with covariance root·rootᵀ in time."""
-    moves = np.tensordot(past, root, (0, 0)).reshape(past.shape[1], -1)
-    return np.linalg.svd(moves, full_matrices=False)[0]
-
-
-class InflowStates:
-    """State space of an `InflowModel` for a batch of B episodes, in the precision of the model; a
-    `ReducedStates`."""
+class InflowStates(ReducedStates):
+    """State space of an `InflowModel`, in the precision of the model."""
 
     def __init__(self, model: InflowModel) -> None:
         self.model = model
@@ -176,9 +168,6 @@ class InflowStates:
         by_x = by_u.reshape(B, m * D, -1) @ self.model.modes
         aged = np.broadcast_to(matrix[..., :h], (B, m, h))
         return np.concatenate([aged, by_x.reshape(B, m, D * r)], axis=2)
-
-    def constrain(self, mean: np.ndarray) -> np.ndarray:
-        return mean
 
     def _window(self, mean: np.ndarray) -> np.ndarray:
         """Return the last x (B, D, r)."""

@@ -32,11 +32,10 @@ def electrode_pairs(n_electrodes: int) -> np.ndarray:
 def pair_currents(world: World) -> np.ndarray:
     """Return the currents (pairs, L) of every pair in A (A/m in 2D), with the largest amplitude of
     the world's cycle."""
-    pairs = electrode_pairs(world.currents.shape[1])
-    currents = np.zeros((len(pairs), world.currents.shape[1]))
-    currents[np.arange(len(pairs)), pairs[:, 0]] = np.abs(world.currents).max()
-    currents[np.arange(len(pairs)), pairs[:, 1]] = -np.abs(world.currents).max()
-    return currents
+    L = world.currents.shape[1]
+    source, sink = electrode_pairs(L).T
+    unit = np.abs(world.currents).max() * np.eye(L)
+    return unit[source] - unit[sink]
 
 
 class Linearisation(NamedTuple):

@@ -17,8 +17,8 @@ from eitbench.estimation.gaussian import LinearMeasurement
 from eitbench.estimation.inflow_response import steady_response
 from eitbench.estimation.nodal import (
     FILTER_RANK_TOLERANCE,
-    Motion,
     NodalStates,
+    flow_motion,
     initial_covariance,
     nodal_filter,
 )
@@ -71,17 +71,18 @@ def reduced_states(world: World, inflow: str) -> tuple[ReducedStates, ReducedSta
     """Return the reduced state space of a world in double and in single precision."""
     if inflow == "learned":
         learned = InflowModel(**_learned(world, "model"))
-        return InflowStates(learned), InflowStates(_single(learned))
+        return InflowStates(learned), InflowStates(single_precision(learned))
     model = load_or_build_model(world)
     if isinstance(model, ReducedModel):
-        return SteadyStates(model), SteadyStates(_single(model))
+        return SteadyStates(model), SteadyStates(single_precision(model))
     flow = require_scalar_velocity(make_task(world))
     bounds = (VELOCITY_BOUNDS[0] * flow.nominal[0], VELOCITY_BOUNDS[1] * flow.nominal[0])
     how = flow.nominal[0], flow.initial_std[0], flow.walk_std[0], bounds
     return JointStates(model, *how), JointStates(model, *how, np.float32)
 
 
-def _single(model: Any) -> Any:
+def single_precision(model: Any) -> Any:
+    """Return a named tuple of arrays in single precision."""
     return type(model)(*(array.astype(np.float32) for array in model))
 
 
@@ -180,28 +181,23 @@ def build_joint_model(world: World) -> JointModel:
     """Return the model of an unknown mean velocity in double precision, in about 45 s."""
     task = make_task(world)
     flow = require_scalar_velocity(task)
-    prior = task.prior
     mass = mass_matrix(task.mesh).toarray()
     record = _random_pair_measurements(world, 45)
-    initial = initial_covariance(task.mesh, prior)
-    nodal = task.evolution.state_noise_covariance(0.0, prior.nodal_std**2)
 
-    def step(part: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return F, Y and Γ_w at a velocity; the nodal part of the noise is constant, as in
-        `VelocityStates`."""
-        F, Y = task.transport_at(np.array([part * flow.nominal[0]])).transition()
-        return F, Y, prior.inflow_std**2 * (Y @ Y.T) + nodal
+    def motion(velocity: float) -> Any:
+        return flow_motion(task, task.transport_at(np.array([velocity])).transition(), 1.0)
 
     learnt = np.zeros_like(mass)
     for part in BASIS_VELOCITIES:
-        F, Y, noise = step(part)
-        covariance = LowRankCovariance(OpenLoopCovariance(F, noise), FILTER_RANK_TOLERANCE)
-        states = NodalStates(np.ones(len(F)), covariance, Motion(F, Y.sum(axis=1)))
+        each = motion(part * flow.nominal[0])
+        open_loop = OpenLoopCovariance(each.transition, each.noise)
+        states = NodalStates(np.ones(len(mass)),
+                             LowRankCovariance(open_loop, FILTER_RANK_TOLERANCE), each)
         learnt += covariance_reduction(Filter(states), record, 10)
-    parts = np.linspace(*VELOCITY_BOUNDS, N_TABULATED_VELOCITIES)
     basis = dominant_directions(learnt, mass, min(WHITE_INFLOW_RANK, len(mass)))
-    return joint_model(basis, mass, initial, parts * flow.nominal[0],
-                       (step(part)[::2] for part in parts))
+    velocities = np.linspace(*VELOCITY_BOUNDS, N_TABULATED_VELOCITIES) * flow.nominal[0]
+    return joint_model(basis, mass, initial_covariance(task.mesh, task.prior), velocities,
+                       map(motion, velocities))
 
 
 def require_scalar_velocity(task: Task) -> VelocityModel:

@@ -73,7 +73,7 @@ def node_voltages(model: TransferResistanceModel, level: float, basis: np.ndarra
     span = scipy.linalg.qr(level_too, mode="economic")[0]
     nodes = _interpolation_nodes(span, 2 * N_LOG_MODES)
     interpolation = span @ np.linalg.pinv(span[nodes])                                # (n, m)
-    quadratic = ScaledVoltageModel(model, level, modes[:, :N_QUADRATIC_MODES]).quadratic
+    quadratic = ScaledVoltageModel(model, level, modes[:, :N_QUADRATIC_MODES])
     resistance, slope, to_modes, curvature = quadratic.tables
     L = len(resistance)
     by_modes = curvature.reshape(*curvature.shape[:2], L, L).transpose(0, 2, 3, 1)

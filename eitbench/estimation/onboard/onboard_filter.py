@@ -2,64 +2,21 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
 import numpy as np
 
+from eitbench.estimation.onboard.episode_filters import EpisodeFilters
 from eitbench.estimation.onboard.full_filters import FullFilters
 from eitbench.estimation.onboard.reduced_filters import ReducedFilters
 
 if TYPE_CHECKING:
-    from eitbench.estimation.onboard.innovation import Innovation
     from eitbench.estimation.onboard.rules import Rules
 
 ESTIMATOR_OPTIONS = ("reduced", "full", "none")
 """Reduced filter for training, exact filter for scores, or no filter."""
 FAULT_EMA_WEIGHT = 0.2
 """Weight of the last injection in the moving average of the fraction of rejected measurements."""
-
-
-class EpisodeFilters(Protocol):
-    """Filters of B episodes, which start at t = 0 with c_ref of the first frame."""
-
-    c_ref: np.ndarray
-    """(B,) ĉ_bh in mol/m³"""
-
-    def __init__(self, rules: Rules, frames: np.ndarray) -> None:
-        """Assimilate the first frame, voltages (B, K, L) in V of the world's cycle."""
-
-    def assimilate(self, voltages: np.ndarray,
-                   currents: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Predict and condition on voltages (B, L) in V for currents (B, L), all zero without an
-        injection; return the innovations in predicted standard deviations and the mask of accepted
-        measurements, both (B, L)."""
-
-    def innovations(self) -> list[Innovation | None]:
-        """Return the last innovation of each episode, for scores; None without an injection or an
-        accepted measurement."""
-
-    def coarse_grid(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return mean and standard deviation (B, patches) in mol/m³ on the coarse grid."""
-
-    def errors(self, moments: np.ndarray, deviations: np.ndarray,
-               squares: np.ndarray) -> np.ndarray:
-        """Return relative errors (5.12) of the present means, from moments (B, …) after `project`.
-        """
-
-    def means(self) -> np.ndarray:
-        """Return estimates (B, n) in mol/m³ on the task's mesh."""
-
-    def stds(self) -> np.ndarray:
-        """Return standard deviations (B, n) of the estimates in mol/m³."""
-
-    def velocity(self) -> tuple[np.ndarray, np.ndarray] | None:
-        """Return velocity parameters θ and their standard deviations (B, k) in m/s; None if the
-        task specifies the velocity."""
-
-    @staticmethod
-    def project(rules: Rules, moment: np.ndarray) -> np.ndarray:
-        """Return moments (T, n) over the scored region in the form for `errors`; see
-        `eitbench.data.episode_cache.ScoreIntegrals`."""
 
 
 def filters_class(rules: Rules, estimator: str) -> type[EpisodeFilters] | None:

@@ -8,33 +8,30 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from eitbench.data.episode_cache import score_mass, scoring_constants
-from eitbench.estimation.onboard.innovation import Innovation
+from eitbench.estimation.onboard.episode_filters import EpisodeFilters, Innovation
 from eitbench.estimation.onboard.linearisation import (
     Linearisation,
-    LinearisationTable,
     linearisation_table,
     std_from_variance,
 )
-from eitbench.estimation.onboard.models import load_or_build_voltages, reduced_states
+from eitbench.estimation.onboard.models import (
+    load_or_build_voltages,
+    reduced_states,
+    single_precision,
+)
 from eitbench.estimation.reduced import ReducedFilter, matvec
 
 if TYPE_CHECKING:
-    from eitbench.estimation.onboard.node_voltages import NodeVoltages
     from eitbench.estimation.onboard.rules import Rules
     from eitbench.worlds.world import World
 
 
-class ReducedFilters:
-    """Reduced filters of B episodes in single precision. See `EpisodeFilters`."""
+class ReducedFilters(EpisodeFilters):
+    """Reduced filters of B episodes in single precision."""
 
-    def __init__(self, rules: Rules, frames: np.ndarray) -> None:
-        self._rules = rules
-        self._shared = shared = SharedData.of(rules)
-        self._indices = shared.levels.nearest_indices(frames, rules.gate)
-        self.c_ref = np.array([shared.levels.c_ref(k) for k in self._indices])
-        self._filter = ReducedFilter(shared.single, len(frames))
-        for k, currents in enumerate(rules.world.currents):
-            self.assimilate(frames[:, k], np.repeat(currents[None], len(frames), axis=0))
+    def _start(self, episodes: int) -> None:
+        self._shared = SharedData.of(self._rules)
+        self._filter = ReducedFilter(self._shared.single, episodes)
 
     def assimilate(self, voltages: np.ndarray,
                    currents: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -42,10 +39,9 @@ class ReducedFilters:
         states = self._shared.single
         mean = self._filter.mean
         coordinates = states.coordinates(mean)
-        computed, matrix, about = self._shared.voltages.linearise(
-            self._indices, coordinates, currents)
+        computed, matrix, about = self._shared.linearise(self._indices, coordinates, currents)
         driven = currents.any(axis=1, keepdims=True)
-        std = self._shared.levels.noise_std(computed, self._rules.instrument.noise_floor)
+        std = self._table.noise_std(computed, self._rules.instrument.noise_floor)
         std = np.where(driven, std, 1.0)
         matrix /= std[..., None].astype(np.float32)
         residual = ((voltages - computed) / std).astype(np.float32) * driven
@@ -59,8 +55,8 @@ class ReducedFilters:
     def innovations(self) -> list[Innovation | None]:
         innovation, std, accepted, currents = self._last
         used = accepted & currents.any(axis=1, keepdims=True)
-        S = self._filter.innovation_covariance
-        return [Innovation.of(*each) for each in zip(innovation, S, std, used, strict=True)]
+        S = self._filter.innovation_covariance * (std[:, :, None] * std[:, None])
+        return [Innovation.of(*each) for each in zip(innovation * std, S, used, strict=True)]
 
     @property
     def coordinates(self) -> np.ndarray:
@@ -120,14 +116,14 @@ class ReducedFilters:
         """Return the filter's linearisation of 𝓡, derivatives (L, L, s), at a predicted mean (s,).
         """
         states = self._shared.states
-        about = self._shared.voltages.about(self._indices[0], states.coordinates(state[None])[0])
+        about = self._shared.linearisation(self._indices[0], states.coordinates(state[None])[0])
         return about._replace(jacobian=self._by_state(state, about.jacobian))
 
     def relinearised_jacobian(self) -> np.ndarray:
         """Return the derivatives (L, L, s) of 𝓡 about the present estimate, computed exactly."""
         level = self.c_ref[0]
         positive = np.maximum(self.means()[0], 0.1 * level)
-        _, table = self._shared.levels.task.observation.resistance_derivatives(positive)
+        _, table = self._table.task.observation.resistance_derivatives(positive)
         by_coordinates = level * np.tensordot(table, self._shared.states.basis, axes=(0, 0))
         return self._by_state(self.state, by_coordinates)
 
@@ -169,75 +165,29 @@ class ReducedFilters:
         whole = 0.5 * (mass.sum(axis=0) + mass.sum(axis=1))  # ∫ of each basis function
         beyond = (world.background - level) * whole + entries["moment"]
         states = beyond @ self._shared.states.basis / level
-        flow = self._shared.levels.task.velocity
+        flow = self._table.task.velocity
         if flow is None:
             return np.asarray(states)
         square = flow.profiles[:, 0]**2 @ flow.weights
         return np.column_stack([states, entries["velocity_moment"][:, 0] / square])
 
 
-class VoltagesAboutReference:
-    """Voltages linearised about c_ref of each episode, in single precision."""
-
-    def __init__(self, levels: LinearisationTable, basis: np.ndarray) -> None:
-        self._levels = levels
-        self._basis = basis
-        self._level = cache(self._projected)
-
-    def _projected(self, index: int) -> Linearisation:
-        level = self._levels.linearisation(index)
-        return level._replace(jacobian=(level.jacobian @ self._basis).astype(np.float32))
-
-    def linearise(self, indices: list[int], coordinates: np.ndarray,
-                  currents: np.ndarray) -> tuple[np.ndarray, ...]:
-        """Return voltages (B, L) in V, derivatives (B, L, q) by the coordinates, and the
-        coordinates (B, q) of the linearisation point."""
-        levels = [self._level(index) for index in indices]
-        resistance = np.array([level.resistance for level in levels])
-        computed = (currents[:, None] @ resistance)[:, 0]
-        matrix = np.array([level.by_state(current)
-                           for level, current in zip(levels, currents, strict=True)])
-        return computed, matrix, np.zeros_like(coordinates)
-
-    def about(self, index: int, coordinates: np.ndarray) -> Linearisation:
-        """Return the linearisation of 𝓡, derivatives (L, L, q), at these coordinates (q,)."""
-        level = self._level(index)
-        return level._replace(jacobian=level.jacobian.astype(float))
-
-
-class VoltagesAboutPrediction:
-    """Voltages linearised about each prediction; members as in `VoltagesAboutReference`."""
-
-    def __init__(self, levels: LinearisationTable, voltages: NodeVoltages) -> None:
-        self._levels = levels
-        self._voltages = voltages
-        self._single = type(voltages)(*(part.astype(np.float32) for part in voltages))
-
-    def linearise(self, indices: list[int], coordinates: np.ndarray,
-                  currents: np.ndarray) -> tuple[np.ndarray, ...]:
-        levels = np.array([self._levels.c_ref(k) for k in indices], np.float32)
-        single = currents.astype(np.float32)
-        return *self._single.linearise(levels, coordinates, single), coordinates
-
-    def about(self, index: int, coordinates: np.ndarray) -> Linearisation:
-        L = len(self._voltages.resistance)
-        each = np.eye(L) - 1.0 / L                      # currents must sum to zero
-        level = self._levels.c_ref(index)
-        return Linearisation(
-            *self._voltages.linearise(np.array([level]), coordinates[None], each))
-
-
 class SharedData:
-    """State space, voltages and scoring constants that all episodes of a world share."""
+    """State space, voltages and scoring constants that all episodes of a world share.
+
+    Voltages are linearised about c_ref of each episode, with a learned inflow about each
+    prediction.
+    """
 
     def __init__(self, world: World, inflow: str) -> None:
         self._made_of = world, inflow
         self.levels = linearisation_table(world)
         self.states, self.single = reduced_states(world, inflow)
+        voltages = load_or_build_voltages(world) if inflow == "learned" else None
+        self._voltages = voltages
+        self._single_voltages = None if voltages is None else single_precision(voltages)
+        self._level = cache(self._projected)
         basis = self.states.basis
-        self.voltages: Any = VoltagesAboutReference(self.levels, basis)
-        if inflow == "learned":
-            self.voltages = VoltagesAboutPrediction(self.levels, load_or_build_voltages(world))
         with_level = np.column_stack([np.ones(len(basis)), basis])
         half = with_level.T @ (score_mass(world) @ with_level)
         self.mass = 0.5 * (half + half.T)
@@ -247,6 +197,37 @@ class SharedData:
             # Φᵀ M Φ = I up to the rounding of the stored Φ, which would break ties.
             self.weight = np.eye(len(self.weight))
         self.patches = (self.levels.grid_averages @ basis).astype(np.float32)
+
+    def _projected(self, index: int) -> Linearisation:
+        level = self.levels.linearisation(index)
+        jacobian = level.jacobian @ self.states.basis
+        return level._replace(jacobian=jacobian.astype(np.float32))
+
+    def linearise(self, indices: list[int], coordinates: np.ndarray,
+                  currents: np.ndarray) -> tuple[np.ndarray, ...]:
+        """Return voltages (B, L) in V, their derivatives (B, L, q) by the coordinates, and the
+        coordinates (B, q) about which they are linearised, in single precision; for predicted
+        coordinates (B, q), c_ref indices and currents (B, L)."""
+        if self._single_voltages is not None:
+            c_ref = np.array([self.levels.c_ref(k) for k in indices], np.float32)
+            single = currents.astype(np.float32)
+            return *self._single_voltages.linearise(c_ref, coordinates, single), coordinates
+        levels = [self._level(index) for index in indices]
+        resistance = np.array([level.resistance for level in levels])
+        computed = (currents[:, None] @ resistance)[:, 0]
+        matrix = np.array([level.by_state(current)
+                           for level, current in zip(levels, currents, strict=True)])
+        return computed, matrix, np.zeros_like(coordinates)
+
+    def linearisation(self, index: int, coordinates: np.ndarray) -> Linearisation:
+        """Return the linearisation of 𝓡, derivatives (L, L, q), at predicted coordinates (q,)."""
+        if self._voltages is None:
+            level = self._level(index)
+            return level._replace(jacobian=level.jacobian.astype(float))
+        L = len(self._voltages.resistance)
+        each = np.eye(L) - 1.0 / L                      # currents must sum to zero
+        c_ref = np.array([self.levels.c_ref(index)])
+        return Linearisation(*self._voltages.linearise(c_ref, coordinates[None], each))
 
     def __deepcopy__(self, memo: dict[int, Any]) -> SharedData:
         return self

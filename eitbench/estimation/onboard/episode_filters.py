@@ -1,0 +1,92 @@
+"""Interface of the filters inside injection environments, and their innovations for scores."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, NamedTuple, Protocol
+
+import numpy as np
+
+from eitbench.estimation.onboard.linearisation import LinearisationTable, linearisation_table
+
+if TYPE_CHECKING:
+    from eitbench.estimation.onboard.rules import Rules
+
+
+class Innovation(NamedTuple):
+    """Innovation of the m measurements that a filter accepted."""
+
+    value: np.ndarray
+    """(m,) ν in V, measured minus predicted"""
+    covariance: np.ndarray
+    """(m, m) predicted S in V²"""
+
+    @classmethod
+    def of(cls, value: np.ndarray, covariance: np.ndarray,
+           accepted: np.ndarray) -> Innovation | None:
+        """Return the innovation of the ``accepted`` measurements (L,), from ν (L,) and S (L, L);
+        None if all were rejected."""
+        if not accepted.any():
+            return None
+        return cls(value[accepted], covariance[np.ix_(accepted, accepted)])
+
+
+class EpisodeFilters(Protocol):
+    """Filters of B episodes, which start at t = 0 with c_ref of the first frame.
+
+    Parameters
+    ----------
+    rules : Rules
+    frames : (B, K, L)
+        Voltages in V of the first frame, the world's cycle.
+    """
+
+    c_ref: np.ndarray
+    """(B,) ĉ_bh in mol/m³"""
+    _rules: Rules
+    _table: LinearisationTable
+    _indices: list[int]
+
+    def __init__(self, rules: Rules, frames: np.ndarray) -> None:
+        self._rules = rules
+        self._table = linearisation_table(rules.world)
+        self._indices = self._table.nearest_indices(frames, rules.gate)
+        self.c_ref = np.array([self._table.c_ref(k) for k in self._indices])
+        self._start(len(frames))
+        for k, currents in enumerate(rules.world.currents):
+            self.assimilate(frames[:, k], np.repeat(currents[None], len(frames), axis=0))
+
+    def _start(self, episodes: int) -> None:
+        """Create the filters at t = 0."""
+
+    def assimilate(self, voltages: np.ndarray,
+                   currents: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Predict and condition on voltages (B, L) in V for currents (B, L), all zero without an
+        injection; return the innovations in predicted standard deviations and the mask of accepted
+        measurements, both (B, L)."""
+
+    def innovations(self) -> list[Innovation | None]:
+        """Return the last innovation of each episode, for scores; None without an injection or an
+        accepted measurement."""
+
+    def coarse_grid(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return mean and standard deviation (B, patches) in mol/m³ on the coarse grid."""
+
+    def errors(self, moments: np.ndarray, deviations: np.ndarray,
+               squares: np.ndarray) -> np.ndarray:
+        """Return relative errors (5.12) of the present means, from moments (B, …) after `project`.
+        """
+
+    def means(self) -> np.ndarray:
+        """Return estimates (B, n) in mol/m³ on the task's mesh."""
+
+    def stds(self) -> np.ndarray:
+        """Return standard deviations (B, n) of the estimates in mol/m³."""
+
+    def velocity(self) -> tuple[np.ndarray, np.ndarray] | None:
+        """Return velocity parameters θ and their standard deviations (B, k) in m/s; None if the
+        task specifies the velocity."""
+
+    @staticmethod
+    def project(rules: Rules, moment: np.ndarray) -> np.ndarray:
+        """Return moments (T, n) over the scored region in the form for `errors`; see
+        `eitbench.data.episode_cache.ScoreIntegrals`."""
