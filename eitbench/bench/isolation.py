@@ -229,27 +229,20 @@ def _numeric(dtype: Any) -> str:
 # -- the parent process -------------------------------------------------------------------------
 
 
-_Key = tuple[str, str, str, str, str, str]
-"""Track, id, kwargs as JSON, method, sha256 of its file, and kind of isolation."""
-_current: dict[_Key, Worker] = {}
-"""The worker of this process, which serves one method in one environment; empty or one entry."""
+_started: list[Worker] = []
+"""The worker that has a process; only one has, so that methods do not compete for the cores."""
 
 
 def load_isolated(track: str, id: str, kwargs: str, method: str, isolation: str) -> Method:
     """Load a method, by name or path, for an environment with these arguments (JSON), without
-    executing its file in this process.
+    executing its file in this process; a `Worker` takes the place of its class.
 
     ``ValueError`` if the file is missing, cannot be loaded, is privileged, or has the name of a
     built-in method.
     """
     path = methods.find_method(method, track)
-    if is_builtin(method):
-        loaded = load_method(method, track)
-        key = (track, id, kwargs, method, loaded.sha256, isolation)
-        loaded = loaded._replace(make=_RemoteClass(key, loaded.suits))
-    else:
-        sha256 = method_sha256(methods.method_files(path))
-        loaded = _load((track, id, kwargs, method, sha256, isolation), path)
+    sha256 = method_sha256(methods.method_files(path))
+    loaded = _load(track, id, kwargs, method, isolation, path, sha256)
     if loaded.privileged:
         raise ValueError(f"{path} is privileged: it needs the ground truth")
     return loaded
@@ -257,61 +250,42 @@ def load_isolated(track: str, id: str, kwargs: str, method: str, isolation: str)
 
 def peak_memory() -> int | None:
     """Return the peak memory in bytes of a process of the current worker; None if unknown."""
-    return next((worker.peak_memory for worker in _current.values()), None)
+    return next((worker.peak_memory for worker in _started), None)
 
 
 def close() -> None:
-    """End the current worker."""
-    while _current:
-        _current.popitem()[1].close()
+    """End the process of the current worker."""
+    while _started:
+        _started.pop().close()
 
 
 atexit.register(close)
 
 
-class _RemoteClass:
-    """Callable in place of a method's class: returns the worker, at the start of an episode."""
-
-    def __init__(self, key: _Key, suits: Callable[[Any], bool]) -> None:
-        self._key = key
-        self.suits = suits
-
-    def __call__(self, task: Any, random: np.random.Generator | None = None) -> Worker:
-        worker = _worker(self._key)
-        worker.begin(random)
-        return worker
-
-
-def _worker(key: _Key) -> Worker:
-    """Return the current worker if it serves this method, else replace it by a new one."""
-    worker = _current.get(key)
-    if worker is None or not worker.is_alive:
-        close()
-        track, id, kwargs, method, _, isolation = key
-        worker = _current[key] = Worker(track, id, json.loads(kwargs), method, isolation)
-    if worker.sha256 not in ("", key[4]):
-        close()
-        raise WorkerError(f"ValueError: {key[3]} was changed during the run")
-    return worker
-
-
 @cache
-def _load(key: _Key, path: Path) -> Method:
-    track, id, _, _, sha256, _ = key
+def _load(track: str, id: str, kwargs: str, method: str, isolation: str, path: Path,
+          sha256: str) -> Method:
+    """Load the method from files with this ``sha256``."""
+    worker = Worker(track, id, json.loads(kwargs), method, isolation)
+    if is_builtin(method):
+        loaded = load_method(method, track)
+        worker.suits = loaded.suits
+        return loaded._replace(make=worker)
     try:
-        about = _worker(key).about
+        worker.start()
     except WorkerError as error:
         raise ValueError(f"{path} cannot be loaded: {error}") from None
+    about = worker.about
     if path.suffix == ".py":
-        about = about | {"name": path.stem}  # a worker may report any name
+        about["name"] = path.stem  # a worker may report any name
     _check_about(path, about, track)
     built_in = methods.builtin_files(id).get(about["name"])
-    if built_in is not None and methods.builtin_sha256(built_in) != sha256:
+    if built_in is not None and methods.builtin_sha256(built_in) != worker.sha256:
         raise ValueError(f"{path} has the name of a built-in method, {about['name']}, under which "
                          "results are stored; rename it")
-    return Method(track, about["name"], about["title"], path, sha256, tuple(about["subtracks"]),
-                  about["parameters"], _RemoteClass(key, lambda _: bool(about.get("suits"))),
-                  about["role"], bool(about.get("privileged")))
+    return Method(track, about["name"], about["title"], path, worker.sha256,
+                  tuple(about["subtracks"]), about["parameters"], worker, about["role"],
+                  bool(about.get("privileged")))
 
 
 def _check_about(path: Path, about: dict[str, Any], track: str) -> None:
@@ -334,9 +308,9 @@ class Worker:
     """A process that runs one estimator or policy in one environment, episode after episode.
 
     ``method`` is the name of a built-in method, or the path of a file. The content of the file is
-    sent to the worker, which makes a separate environment. A reply may take ``reply_timeout``
-    seconds. `WorkerError` if the method cannot be loaded; ``ValueError`` if a worker under
-    bubblewrap could read the cache folder.
+    read once and sent to the process, which makes a separate environment. A reply may take
+    ``reply_timeout`` seconds. Calls raise `WorkerError` if the method fails, and ``ValueError`` if
+    a process under bubblewrap could read the cache folder.
     """
 
     def __init__(self, track: str, id: str, kwargs: dict[str, Any], method: str,
@@ -345,12 +319,19 @@ class Worker:
         self.reply_timeout = reply_timeout
         self.sha256 = ""
         """hash of the method's file; empty for a built-in method"""
+        self.about: dict[str, Any] = {}
+        """Unchecked attributes that the method's class reports."""
+        self.suits: Callable[[Any], bool] = lambda _: bool(self.about.get("suits"))
         self._name = sanitize(Path(method).stem)
         self._limits = limits or Limits()
-        self._left_s, self._left_chars = EPISODE_TIMEOUT_S, MAX_OUTPUT_CHARS
-        self._next_check = 0.0
         self._is_confined = isolation == "bubblewrap"
-        self._home = Path("/tmp" if self._is_confined else tempfile.mkdtemp(prefix="eitbench-"))
+        self._next_check = 0.0
+        self._process: Any = None
+        self._request = {"track": track, "id": id, "kwargs": kwargs, **self._files(id, method)}
+
+    def start(self) -> None:
+        """End the process of the current worker, and start one that loads the method."""
+        close()
         command = [sys.executable, "-P", "-c", f"from {__name__} import main; main()",
                    json.dumps(self._limits)]
         if self._is_confined:
@@ -358,25 +339,30 @@ class Worker:
             models = cache_folder() / model_key("", None, 0).folder         # holds no episode
             files = {"/tmp/cache/models": str(models.absolute())}
             command = [*bubblewrap(self._limits, files), *command]
+        self._folder = tempfile.TemporaryDirectory(prefix="eitbench-", ignore_cleanup_errors=True)
+        self._home = Path("/tmp" if self._is_confined else self._folder.name)
         self._socket, theirs = socket.socketpair()
         self._socket.settimeout(CHECK_INTERVAL_S)
         with theirs:
             self._process = subprocess.Popen(
                 command, stdin=theirs.fileno(), stdout=theirs.fileno(), stderr=subprocess.DEVNULL,
                 start_new_session=True, env=self._environment(), cwd="/")
+        _started.append(self)
+        self._left_s, self._left_chars = EPISODE_TIMEOUT_S, MAX_OUTPUT_CHARS
         try:
-            self.about = self._ask("load", track=track, id=id, kwargs=kwargs,
-                                   **self._files(id, method))[0]
-            """Unchecked attributes that the method's class reports."""
+            self.about = self._ask("load", **self._request)[0]
         except BaseException:
             self.close()
             raise
 
-    def begin(self, random: np.random.Generator | None = None) -> None:
-        """Begin an episode with a new instance of the method; a policy draws from a generator with
-        the state of ``random``."""
+    def __call__(self, task: Any, random: np.random.Generator | None = None) -> Worker:
+        """Begin an episode with a new instance of the method, like its class; a policy draws from a
+        generator with the state of ``random``."""
+        if not self.is_alive:
+            self.start()
         self._left_s, self._left_chars = EPISODE_TIMEOUT_S, MAX_OUTPUT_CHARS
         self._ask("begin", random=None if random is None else random.bit_generator.state)
+        return self
 
     def update(self, voltages: np.ndarray, currents: np.ndarray) -> Any:
         """Return the estimator's `Estimate`, or None, after a measurement."""
@@ -397,8 +383,8 @@ class Worker:
 
     @property
     def is_alive(self) -> bool:
-        """True unless the process ended: after a crash, a limit or a malformed message."""
-        return self._process.poll() is None
+        """True if the process runs; it ends after a crash, a limit or a malformed message."""
+        return self._process is not None and self._process.poll() is None
 
     @property
     def peak_memory(self) -> int | None:
@@ -407,10 +393,10 @@ class Worker:
 
     def close(self) -> None:
         """End the process and its children, and remove its folder."""
-        self._kill()
-        self._socket.close()
-        if not self._is_confined:
-            shutil.rmtree(self._home, ignore_errors=True)
+        if self._process is not None:
+            self._kill()
+            self._socket.close()
+            self._folder.cleanup()
 
     def _environment(self) -> dict[str, str]:
         """Return the worker's environment variables, without other variables of this process."""

@@ -16,9 +16,7 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-import os
 import re
-import stat
 import warnings
 from collections.abc import Iterable, Iterator
 from contextlib import suppress
@@ -94,8 +92,7 @@ def read_json(path: Path) -> Any:
     """Read the JSON of a file; ``ValueError``, without the file's name, if it is too large, nested
     too deeply, not UTF-8, or has a number that is not finite (NaN, Infinity, 1e999)."""
     try:
-        status = os.stat(path)
-        if not stat.S_ISREG(status.st_mode) or status.st_size > MAX_BYTES:
+        if path.stat().st_size > MAX_BYTES or not path.is_file():
             raise ValueError(f"it must be a file of at most {MAX_BYTES >> 20} MiB")
         content = orjson.loads(path.read_bytes())
         _check.depth("lists and objects", content, MAX_RECORD_DEPTH)

@@ -202,7 +202,7 @@ def _run_job(job: Job, store: EpisodeStore, run: dict[str, Any], home: str,
     elsewhere = {} if platform.node() == home else {"machine": machine()}
     result["run"] = run | elsewhere | {"isolation": job.isolation}
     try:
-        store.put(job.environment.name, result["method"], job.seed, result, fields)
+        store.put(result, fields)
     except OSError:
         isolation.close()  # the worker's folder may fill the disk
-        store.put(job.environment.name, result["method"], job.seed, result, fields)
+        store.put(result, fields)

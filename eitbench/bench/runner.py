@@ -203,12 +203,13 @@ class EstimatorOutput:
 def _run_policy(env: InjectionEnv, policy: Method, seed: int) -> EpisodeRun:
     seconds = 0.0
     currents = list[np.ndarray]()
-    scored = list[tuple[Any, ...]]()
     actions = list[Any]()
+    scored = list[tuple[Any, ...]]()
     # `iter_injections` does not measure the time of this loop's body
-    for t, observation, elapsed in iter_injections(env, policy, seed, actions):
+    for t, observation, elapsed, action in iter_injections(env, policy, seed):
         seconds += elapsed
         currents.append(observation["currents"])
+        actions.append(action)
         if (error := env.error) is not None:
             means, stds = env.core.estimate()
             scored.append((t, error, means[0], stds[0], env.core.innovations()[0]))
@@ -227,11 +228,11 @@ def _run_policy(env: InjectionEnv, policy: Method, seed: int) -> EpisodeRun:
     return EpisodeRun(outcome, np.array(currents), {}, actions)
 
 
-def iter_injections(env: InjectionEnv, policy: Method, seed: int, actions: list[Any] | None = None,
-               ) -> Iterator[tuple[int, dict[str, np.ndarray], float]]:
-    """Yield (t of the observed state, observation, seconds of the policy) after each injection of
-    one episode. The first time includes the policy's constructor. Actions are appended to
-    ``actions``. Errors as in `run_method`."""
+def iter_injections(env: InjectionEnv, policy: Method, seed: int,
+                    ) -> Iterator[tuple[int, dict[str, np.ndarray], float, Any]]:
+    """Yield (t of the observed state, observation, seconds of the policy, its action, JSON-ready)
+    after each injection of one episode. The first time includes the policy's constructor. Errors as
+    in `run_method`."""
     if not policy.suits(env.rules):
         raise ValueError(f"policy {policy.name} does not suit {env.spec.id if env.spec else env}")
     with allow_test_seeds():
@@ -245,10 +246,8 @@ def iter_injections(env: InjectionEnv, policy: Method, seed: int, actions: list[
         action = player.act(observation)
         seconds = time.perf_counter() - begin
         observation, _, done, _, _ = env.step(action)
-        if actions is not None:
-            actions.append(np.asarray(action).tolist())
         t += 1
-        yield t, observation, seconds
+        yield t, observation, seconds, np.asarray(action).tolist()
         begin = time.perf_counter()
 
 

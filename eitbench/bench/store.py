@@ -56,13 +56,12 @@ class EpisodeStore:
     def __init__(self, folder: Path) -> None:
         self.folder = Path(folder).absolute()           # workers may have other working folders
 
-    def put(self, environment: str, method: str, seed: int, result: dict[str, Any],
-            fields: dict[str, np.ndarray]) -> None:
+    def put(self, result: dict[str, Any], fields: dict[str, np.ndarray]) -> None:
         """Store the ``result`` and the estimates ``fields`` of one episode.
 
         The estimates are written first, so that each stored result has its estimates.
         """
-        path = self._path(environment, method, format_seed(seed))
+        path = self._path(result["environment"]["name"], result["method"], result["seed"])
         if fields:
             content = io.BytesIO()
             np.savez_compressed(content, **fields)  # type: ignore[arg-type]

@@ -163,13 +163,11 @@ def record_name(environment: str, method: str, version: str, split: str) -> str:
 def subtrack_of(env: EstimationEnv | InjectionEnv) -> str:
     """Return the subtrack of an environment, one of its track's `SUBTRACKS`."""
     lag = getattr(env, "lag", None)
-    return "injection" if lag is None else _subtrack_of_lag(lag, env.world.n_steps)
-
-
-def _subtrack_of_lag(lag: int, n_steps: int) -> str:
+    if lag is None:
+        return "injection"
     if lag == 0:
         return "filter"
-    return "smoothing" if lag == n_steps - 1 else "fixed-lag"
+    return "smoothing" if lag == env.world.n_steps - 1 else "fixed-lag"
 
 
 def subtracks_of(id: str, kwargs: dict[str, Any]) -> tuple[str, ...]:
@@ -192,9 +190,11 @@ def subtracks_of(id: str, kwargs: dict[str, Any]) -> tuple[str, ...]:
         return ("smoothing",)
     if type(lag) is not int or lag < 0:
         raise ValueError(f"lag must be 'all' or an integer of at least 0, got {lag!r}")
-    if lag and kwargs.get("world"):                         # its length is not computed here
+    if lag == 0:
+        return ("filter",)
+    if kwargs.get("world"):                                 # its length is not computed here
         return ("fixed-lag", "smoothing")
-    return (_subtrack_of_lag(lag, each.world.n_steps),)
+    return ("smoothing",) if lag == each.world.n_steps - 1 else ("fixed-lag",)
 
 
 def category_of(id: str, board: str) -> str:

@@ -53,9 +53,7 @@ def failed(seed):
 
 
 def put(store, made, fields=None):
-    """Store a result under its names."""
-    seed = int(made["seed"].removeprefix("train:"))
-    store.put(made["environment"]["name"], made["method"], seed, made, fields or {})
+    store.put(made, fields or {})
 
 
 # -- episodes ---------------------------------------------------------------------------------------------------------
@@ -196,7 +194,7 @@ def test_splits_are_not_mixed(store):
     """Development and training seeds are never in the record of another split; seeds are in numerical order."""
     for seed in (10, 9, 100):
         put(store, result(seed))
-    store.put(ENV, "mine", 100_001, result(1) | {"seed": format_seed(100_001)}, {})
+    put(store, result(100_001))
     assert sorted(tuple(record["seeds"]) for record in store.write_records()) == [
         ("dev:1",), ("train:9", "train:10", "train:100")]
 
