@@ -46,7 +46,7 @@ def load(folder: Path | str | None = None, *, measured: bool = False) -> pd.Data
         from eitbench._files import bundled_path
         from eitbench.bench.records import read_records, read_valid_files, split_outdated
     path = Path(folder or bundled_path("leaderboards") / "results")
-    records = read_records(path, keep=_without_steps)
+    records = read_records(path)
     if measured:
         records += read_valid_files(path, measured=True)[0].values()
     groups = split_outdated(records)
@@ -67,10 +67,3 @@ def _rows(record: dict[str, Any], outdated: bool) -> Iterator[tuple[Any, ...]]:
         for metric, value in scores.items():
             if value is not None:
                 yield *first, episode["seed"], episode["status"], metric, value
-
-
-def _without_steps(record: dict[str, Any]) -> dict[str, Any]:
-    """Drop the errors of single steps, which no row holds and which are most of a record."""
-    for episode in record["episodes"]:
-        episode.pop("step_errors", None)
-    return record

@@ -40,17 +40,14 @@ def episode_table(records: Iterable[dict[str, Any]]) -> str:
     rows = [(record, episode) for record in records for episode in record["episodes"]]
     scores = sorted({name for _, episode in rows for name in episode.get("scores", {})})
     text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow([*_COLUMNS, *scores])
+    writer = csv.DictWriter(text, [*_COLUMNS, *scores], extrasaction="ignore", lineterminator="\n")
+    writer.writeheader()
     for record, episode in rows:
         environment = record["environment"]
-        own = episode.get("scores", {})
-        finished = max(each["finished"] for each in record["episodes"])
-        writer.writerow([
-            environment["id"], environment["name"],
-            json.dumps(environment["kwargs"], sort_keys=True),
-            *(record[name] for name in _OF_RECORDS), finished, episode["seed"], episode["status"],
-            episode["peak_memory"], *(own.get(name) for name in scores)])
+        writer.writerow(record | episode | episode.get("scores", {}) | {
+            "id": environment["id"], "environment": environment["name"],
+            "kwargs": json.dumps(environment["kwargs"], sort_keys=True),
+            "finished": max(each["finished"] for each in record["episodes"])})
     return text.getvalue()
 
 

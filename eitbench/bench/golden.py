@@ -20,25 +20,10 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from eitbench._files import PACKAGE, write_atomically
-from eitbench.bench import runner, tracks
-from eitbench.bench.methods import (
-    baseline_folder,
-    builtin_agents,
-    builtin_methods,
-    golden_name,
-    golden_version,
-    is_path,
-    load_method,
-)
+from eitbench.bench import methods, runner, tracks
+from eitbench.bench.methods import is_path, load_method
 from eitbench.bench.scores import compute_scores, scores
-from eitbench.data.episode_cache import (
-    build_cached_episode,
-    cycle_voltages,
-    instrument_faults,
-    integrals,
-    score_mass,
-    step_error,
-)
+from eitbench.data import episode_cache
 from eitbench.data.episodes import Episode, cached_truth_model
 from eitbench.data.seeds import format_seed, parse_seeds
 from eitbench.estimation import best_homogeneous
@@ -48,7 +33,7 @@ from eitbench.worlds.task import make_task
 from eitbench.worlds.world import World
 
 WORLD_FOLDER = PACKAGE / "worlds" / "golden"
-METHOD_FOLDER = baseline_folder() / "golden"
+METHOD_FOLDER = methods.baseline_folder() / "golden"
 FIRST_STEPS = 24
 """Number of simulated steps of a shortened episode; they include the first scored steps."""
 WORLD_EPISODES = {"train:0": FIRST_STEPS, "dev:0": None}
@@ -70,9 +55,10 @@ RTOL_FLOAT32 = 1e-4
 
 def golden_methods() -> dict[str, str]:
     """Map the name of each method's golden file to the method: a name, or an agent's path."""
-    agents = {golden_name(Path(path)): path
-              for id in tracks.ids("injection") for path in reversed(builtin_agents(id))}
-    return {name: name for track in tracks.TRACKS for name in builtin_methods(track)} | agents
+    agents = {methods.golden_name(Path(path)): path
+              for id in tracks.ids("injection") for path in reversed(methods.builtin_agents(id))}
+    names = [name for track in tracks.TRACKS for name in methods.builtin_methods(track)]
+    return dict(zip(names, names, strict=True)) | agents
 
 
 def golden_path(name: str) -> Path:
@@ -101,7 +87,11 @@ def check(name: str, *, is_quick: bool = False) -> list[str]:
     if expected is None:
         return [f"{name} has no golden file: {golden_path(name)} is missing"]
     if name in tracks.builtin_ids():
-        return _world_differences(name, expected, is_quick=is_quick)
+        computed = json.loads(world_text(world_golden(name, is_quick=is_quick)))
+        if is_quick:
+            expected |= {part: {seed: expected[part][seed] for seed in FAST_EPISODES}
+                         for part in ("episodes", "observations")}
+        return [f"{name}: {sentence}" for sentence in differences(computed, expected)]
     if is_quick:
         expected["episodes"] = expected["episodes"][:1]
     return _method_differences(expected, _method_golden(expected, golden_methods()[name]))
@@ -121,13 +111,13 @@ def update(names: list[str], *, new_version: bool = False) -> Iterator[tuple[str
 
     ``ValueError`` if a name is neither a built-in id nor a built-in method.
     """
-    ids, methods = tracks.builtin_ids(), golden_methods()
-    if unknown := [name for name in names if name not in ids and name not in methods]:
-        raise ValueError(f"names must be ids, or methods of {', '.join(methods)}; got "
+    ids, known = tracks.builtin_ids(), golden_methods()
+    if unknown := [name for name in names if name not in ids and name not in known]:
+        raise ValueError(f"names must be ids, or methods of {', '.join(known)}; got "
                          f"{', '.join(unknown)}")
-    for name in names or [*ids, *methods]:
-        if name in methods:
-            yield (name, *_update_method(name, methods[name], new_version))
+    for name in names or [*ids, *known]:
+        if name in known:
+            yield (name, *_update_method(name, known[name], new_version))
         elif golden_path(name).is_file():
             moved = check(name)
             yield name, "moved" if moved else "same", moved
@@ -153,7 +143,7 @@ def _update_method(name: str, method: str, new_version: bool) -> tuple[str, list
         status = f"v{computed['version']}" if expected else "new"
     if computed != expected:
         write_atomically(golden_path(name), _method_text(computed).encode())
-        golden_version.cache_clear()
+        methods.golden_version.cache_clear()
     return status, moved
 
 
@@ -230,14 +220,6 @@ def _rounded(value: Any) -> Any:
     return [float(f"{number:.10g}") for number in np.ravel(value)]
 
 
-def _world_differences(id: str, expected: dict[str, Any], *, is_quick: bool) -> list[str]:
-    computed = json.loads(world_text(world_golden(id, is_quick=is_quick)))
-    if is_quick:
-        expected = expected | {part: {name: expected[part][name] for name in FAST_EPISODES}
-                               for part in ("episodes", "observations")}
-    return [f"{id}: {sentence}" for sentence in differences(computed, expected)]
-
-
 def _sample(values: np.ndarray) -> np.ndarray:
     """Return four entries of (n,) and the mean of all."""
     n = len(values)
@@ -283,17 +265,18 @@ def _episode_numbers(world: World, name: str) -> dict[str, Any]:
     episode = _episode(world.truth_config, name)
     task = make_task(world.truth_config)
     L = world.vessel.n_electrodes
-    entries = build_cached_episode(world, episode)
-    moments, deviations, squares = integrals(world, entries)
-    voltages = cycle_voltages(world, seed, entries)
-    sound = cycle_voltages(world.fault_free, seed, entries)[:world.calibration]
+    entries = episode_cache.build_cached_episode(world, episode)
+    moments, deviations, squares = episode_cache.integrals(world, entries)
+    voltages = episode_cache.cycle_voltages(world, seed, entries)
+    sound = episode_cache.cycle_voltages(world.fault_free, seed, entries)[:world.calibration]
     cycle = world.currents[np.arange(world.calibration) % len(world.currents)]
     homogeneous = best_homogeneous(task.observation, world.noise, task.mesh.n_nodes, sound, cycle,
                                    world.expected_concentration)
     level = np.full(task.mesh.n_nodes, homogeneous - world.background)
-    errors = [float(step_error(score_mass(world), level, moments[k], deviations[k], squares[k]))
+    mass = episode_cache.score_mass(world)
+    errors = [float(episode_cache.step_error(mass, level, moments[k], deviations[k], squares[k]))
               for k in range(world.warm_up, len(entries))]
-    faults = instrument_faults(world, seed)
+    faults = episode_cache.instrument_faults(world, seed)
     steps = _shown_steps(len(entries))
     numbers = {
         "seed": format_seed(seed),
@@ -360,7 +343,7 @@ def _can_play(method: str, id: str, kwargs: dict[str, Any]) -> bool:
     asked = tracks.Environment(id, json.dumps(kwargs))
     if is_path(method):
         return Path(method).parents[2].name == id.replace("/", "-")
-    return method in builtin_methods(asked.track) and runner.is_compatible(
+    return method in methods.builtin_methods(asked.track) and runner.is_compatible(
         load_method(method, asked.track), runner.cached_environment(asked))
 
 

@@ -16,9 +16,9 @@ import json
 import math
 import os
 import re
-import select
 import shutil
 import signal
+import socket
 import struct
 import subprocess
 import sys
@@ -39,20 +39,8 @@ from eitbench import _check
 from eitbench._files import PACKAGE
 from eitbench._notice import notify
 from eitbench._sanitize import error_location, sanitize, user_traceback
-from eitbench.bench.methods import (
-    MAX_PARAMETERS_BYTES,
-    MAX_TITLE_CHARS,
-    ROLES,
-    Method,
-    builtin_files,
-    builtin_sha256,
-    find_method,
-    is_builtin,
-    is_path,
-    load_method,
-    method_files,
-    method_sha256,
-)
+from eitbench.bench import methods
+from eitbench.bench.methods import Method, is_builtin, is_path, load_method, method_sha256
 from eitbench.bench.tracks import SUBTRACKS, Environment, is_measured
 from eitbench.data.cache import CACHE_VARIABLE, cache_folder, model_key
 from eitbench.worlds.random_streams import generator_from_state
@@ -60,8 +48,6 @@ from eitbench.worlds.registry import import_entries, runtime_entries
 
 ISOLATE = ("auto", "none", "process", "bubblewrap")
 """Values of the option ``isolate``."""
-INSTALL = ("install bubblewrap (apt-get install bubblewrap), or accept a process that can read "
-           "your files with --isolate process")
 REPLY_TIMEOUT_S = 600.0
 EPISODE_TIMEOUT_S = 6 * 3600.0
 CHECK_INTERVAL_S = 0.2
@@ -76,8 +62,6 @@ NUMERIC_ENV = ("OPENBLAS_", "MKL_", "OMP_", "NPY_", "NUMBA_CPU")
 ETC = ("alternatives", "group", "ld.so.cache", "localtime", "nsswitch.conf", "passwd")
 _NUMERIC_DTYPE = re.compile(r"[<>|][biuf][1248]")
 _ENTRY_POINTS = ("eitbench.worlds", "eitbench.methods", "eitbench.scores", "eitbench.loaders")
-_PR_SET_PDEATHSIG = 1
-_START = "from eitbench.bench.isolation import main; main()"
 
 Arrays = Mapping[str, np.ndarray]
 
@@ -128,7 +112,9 @@ def choose_isolation(environment: Environment, method: str, isolate: str = "auto
     if strict and third_party and kind == "none":
         raise ValueError(f"isolate must be bubblewrap or process for the third-party file {method}")
     if kind == "bubblewrap" and (reason := bubblewrap_problem()):
-        raise ValueError(f"{method} must run under bubblewrap, but {reason}; {INSTALL}")
+        raise ValueError(f"{method} must run under bubblewrap, but {reason}; install bubblewrap "
+                         "(apt-get install bubblewrap), or accept a process that can read your "
+                         "files with --isolate process")
     if kind == "process" and third_party:
         _notify_of_process(method)
     return kind
@@ -194,18 +180,21 @@ def check_out_of_reach(path: Path, name: str) -> None:
 # -- messages -----------------------------------------------------------------------------------
 
 
-def encode_message(header: Mapping[str, Any], arrays: Arrays | None = None) -> bytes:
-    """Encode a message: two lengths, JSON of header and array layout, and the arrays' bytes."""
-    blocks = {name: np.asarray(array, order="C") for name, array in (arrays or {}).items()}
+def encode_message(content: Mapping[str, Any]) -> bytes:
+    """Encode named arrays and other values, which must fit for JSON: two lengths, JSON of the
+    values and the arrays' layout, and the arrays' bytes."""
+    blocks = {name: np.asarray(array, order="C") for name, array in content.items()
+              if isinstance(array, np.ndarray)}
+    values = {name: value for name, value in content.items() if name not in blocks}
     layout = [[name, _numeric(block.dtype.str), block.shape] for name, block in blocks.items()]
-    head = json.dumps([header, layout]).encode()
+    head = json.dumps([values, layout]).encode()
     body = b"".join(block.tobytes() for block in blocks.values())
     return struct.pack("<QQ", len(head), len(body)) + head + body
 
 
 def decode_message(read: Callable[[int], bytes], max_array_bytes: int = MAX_ARRAY_BYTES,
                    ) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    """Decode header and arrays of the next message; ``read(n)`` returns exactly n bytes.
+    """Decode the values and the arrays of the next message; ``read(n)`` returns exactly n bytes.
     ``ValueError`` if the message is too long or malformed."""
     head_bytes, body_bytes = struct.unpack("<QQ", read(16))
     if head_bytes > MAX_HEADER_BYTES or body_bytes > max_array_bytes:
@@ -215,19 +204,19 @@ def decode_message(read: Callable[[int], bytes], max_array_bytes: int = MAX_ARRA
     arrays = {}
     position = 0
     try:
-        header, layout = json.loads(head, parse_constant=_numeric)
-        _check.depth("header", header)
-        json.dumps(header, ensure_ascii=False).encode()  # a lone surrogate cannot be stored
+        values, layout = json.loads(head, parse_constant=_numeric)
+        _check.depth("values", values)
+        json.dumps(values, ensure_ascii=False).encode()  # a lone surrogate cannot be stored
         for name, dtype, shape in layout:
             sizes = [_check.integer("axis", size, low=0, high=max_array_bytes) for size in shape]
             array = np.frombuffer(body + b"\0" * 8, _numeric(dtype), math.prod(sizes), position)
             arrays[str(name)] = array.reshape(sizes).copy()
             position += array.nbytes
-        if position != body_bytes or not isinstance(header, dict):
+        if position != body_bytes or not isinstance(values, dict):
             raise ValueError("the arrays must fill the message")
     except (TypeError, ValueError, OverflowError, RecursionError) as error:
         raise ValueError(f"a message must be JSON and the arrays that it names: {error}") from None
-    return header, arrays
+    return values, arrays
 
 
 def _numeric(dtype: Any) -> str:
@@ -240,89 +229,63 @@ def _numeric(dtype: Any) -> str:
 # -- the parent process -------------------------------------------------------------------------
 
 
-_Key = tuple[str, str, str, str, str, str]
-"""Track, id, kwargs as JSON, method, sha256 of its file, and kind of isolation."""
-_current: dict[_Key, Worker] = {}
-"""The worker of this process, which serves one method in one environment; empty or one entry."""
+_started: list[Worker] = []
+"""The worker that has a process; only one has, so that methods do not compete for the cores."""
 
 
 def load_isolated(track: str, id: str, kwargs: str, method: str, isolation: str) -> Method:
     """Load a method, by name or path, for an environment with these arguments (JSON), without
-    executing its file in this process.
+    executing its file in this process; a `Worker` takes the place of its class.
 
     ``ValueError`` if the file is missing, cannot be loaded, is privileged, or has the name of a
     built-in method.
     """
-    path = find_method(method, track)
-    if is_builtin(method):
-        loaded = load_method(method, track)
-        if loaded.privileged:
-            raise ValueError(f"{path} is privileged: it needs the ground truth")
-        key = (track, id, kwargs, method, loaded.sha256, isolation)
-        return loaded._replace(make=_RemoteClass(key, loaded.suits))
-    sha256 = method_sha256(method_files(path))
-    return _load((track, id, kwargs, method, sha256, isolation), path)
+    path = methods.find_method(method, track)
+    sha256 = method_sha256(methods.method_files(path))
+    loaded = _load(track, id, kwargs, method, isolation, path, sha256)
+    if loaded.privileged:
+        raise ValueError(f"{path} is privileged: it needs the ground truth")
+    return loaded
 
 
 def peak_memory() -> int | None:
     """Return the peak memory in bytes of a process of the current worker; None if unknown."""
-    return next((worker.peak_memory for worker in _current.values()), None)
+    return next((worker.peak_memory for worker in _started), None)
 
 
 def close() -> None:
-    """End the current worker."""
-    while _current:
-        _current.popitem()[1].close()
+    """End the process of the current worker."""
+    while _started:
+        _started.pop().close()
 
 
 atexit.register(close)
 
 
-class _RemoteClass:
-    """Callable in place of a method's class: returns the worker, at the start of an episode."""
-
-    def __init__(self, key: _Key, suits: Callable[[Any], bool]) -> None:
-        self._key = key
-        self.suits = suits
-
-    def __call__(self, task: Any, random: np.random.Generator | None = None) -> Worker:
-        worker = _worker(self._key)
-        worker.begin(random)
-        return worker
-
-
-def _worker(key: _Key) -> Worker:
-    """Return the current worker if it serves this method, else replace it by a new one."""
-    worker = _current.get(key)
-    if worker is None or not worker.is_alive:
-        close()
-        track, id, kwargs, method, _, isolation = key
-        worker = _current[key] = Worker(track, id, json.loads(kwargs), method, isolation)
-    if worker.sha256 not in ("", key[4]):
-        close()
-        raise WorkerError(f"ValueError: {key[3]} was changed during the run")
-    return worker
-
-
 @cache
-def _load(key: _Key, path: Path) -> Method:
-    track, id, _, _, sha256, _ = key
+def _load(track: str, id: str, kwargs: str, method: str, isolation: str, path: Path,
+          sha256: str) -> Method:
+    """Load the method from files with this ``sha256``."""
+    worker = Worker(track, id, json.loads(kwargs), method, isolation)
+    if is_builtin(method):
+        loaded = load_method(method, track)
+        worker.suits = loaded.suits
+        return loaded._replace(make=worker)
     try:
-        about = _worker(key).about
+        worker.start()
     except WorkerError as error:
         raise ValueError(f"{path} cannot be loaded: {error}") from None
-    if about.get("privileged"):
-        raise ValueError(f"{path} is privileged: it needs the ground truth")
+    about = worker.about
     if path.suffix == ".py":
-        about = about | {"name": path.stem}  # a worker may report any name
+        about["name"] = path.stem  # a worker may report any name
     _check_about(path, about, track)
-    built_in = builtin_files(id).get(about["name"])
-    if built_in is not None and builtin_sha256(built_in) != sha256:
+    built_in = methods.builtin_files(id).get(about["name"])
+    if built_in is not None and methods.builtin_sha256(built_in) != worker.sha256:
         raise ValueError(f"{path} has the name of a built-in method, {about['name']}, under which "
                          "results are stored; rename it")
-    return Method(track, about["name"], about["title"], path, sha256, tuple(about["subtracks"]),
-                  about["parameters"], _RemoteClass(key, lambda _: bool(about.get("suits"))),
-                  about["role"])
+    return Method(track, about["name"], about["title"], path, worker.sha256,
+                  tuple(about["subtracks"]), about["parameters"], worker, about["role"],
+                  bool(about.get("privileged")))
 
 
 def _check_about(path: Path, about: dict[str, Any], track: str) -> None:
@@ -331,23 +294,23 @@ def _check_about(path: Path, about: dict[str, Any], track: str) -> None:
                                     for key in ("name", "title", "subtracks", "role"))
     valid = {
         "name": isinstance(name, str) and METHOD_NAME.fullmatch(name) and sanitize(name) == name,
-        "title": (isinstance(title, str) and 0 < len(title) <= MAX_TITLE_CHARS
+        "title": (isinstance(title, str) and 0 < len(title) <= methods.MAX_TITLE_CHARS
                   and sanitize(title) == title),
-        "role": role is None or role in ROLES,
+        "role": role is None or role in methods.ROLES,
         "subtracks": isinstance(subtracks, list) and subtracks and all(
             each in SUBTRACKS[track] for each in subtracks)}
     if wrong := [key for key, is_valid in valid.items() if not is_valid]:
         raise ValueError(f"{path} reports an invalid {', '.join(wrong)}")
-    _check.json_object(f"{path}: parameters", about.get("parameters"), MAX_PARAMETERS_BYTES)
+    _check.json_object(f"{path}: parameters", about.get("parameters"), methods.MAX_PARAMETERS_BYTES)
 
 
 class Worker:
     """A process that runs one estimator or policy in one environment, episode after episode.
 
     ``method`` is the name of a built-in method, or the path of a file. The content of the file is
-    sent to the worker, which makes a separate environment. A reply may take ``reply_timeout``
-    seconds. `WorkerError` if the method cannot be loaded; ``ValueError`` if a worker under
-    bubblewrap could read the cache folder.
+    read once and sent to the process, which makes a separate environment. A reply may take
+    ``reply_timeout`` seconds. Calls raise `WorkerError` if the method fails, and ``ValueError`` if
+    a process under bubblewrap could read the cache folder.
     """
 
     def __init__(self, track: str, id: str, kwargs: dict[str, Any], method: str,
@@ -356,58 +319,72 @@ class Worker:
         self.reply_timeout = reply_timeout
         self.sha256 = ""
         """hash of the method's file; empty for a built-in method"""
+        self.about: dict[str, Any] = {}
+        """Unchecked attributes that the method's class reports."""
+        self.suits: Callable[[Any], bool] = lambda _: bool(self.about.get("suits"))
         self._name = sanitize(Path(method).stem)
         self._limits = limits or Limits()
-        self._left_s, self._left_chars = EPISODE_TIMEOUT_S, MAX_OUTPUT_CHARS
-        self._next_check = 0.0
         self._is_confined = isolation == "bubblewrap"
-        self._home = Path("/tmp" if self._is_confined else tempfile.mkdtemp(prefix="eitbench-"))
-        command = [sys.executable, "-P", "-c", _START, json.dumps(self._limits)]
+        self._next_check = 0.0
+        self._process: Any = None
+        self._request = {"track": track, "id": id, "kwargs": kwargs, **self._files(id, method)}
+
+    def start(self) -> None:
+        """End the process of the current worker, and start one that loads the method."""
+        close()
+        command = [sys.executable, "-P", "-c", f"from {__name__} import main; main()",
+                   json.dumps(self._limits)]
         if self._is_confined:
             check_out_of_reach(cache_folder(), "the cache folder")
             models = cache_folder() / model_key("", None, 0).folder         # holds no episode
             files = {"/tmp/cache/models": str(models.absolute())}
             command = [*bubblewrap(self._limits, files), *command]
-        self._process = subprocess.Popen(
-            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL,
-            start_new_session=True, env=self._environment(), cwd="/")
+        self._folder = tempfile.TemporaryDirectory(prefix="eitbench-", ignore_cleanup_errors=True)
+        self._home = Path("/tmp" if self._is_confined else self._folder.name)
+        self._socket, theirs = socket.socketpair()
+        self._socket.settimeout(CHECK_INTERVAL_S)
+        with theirs:
+            self._process = subprocess.Popen(
+                command, stdin=theirs.fileno(), stdout=theirs.fileno(), stderr=subprocess.DEVNULL,
+                start_new_session=True, env=self._environment(), cwd="/")
+        _started.append(self)
+        self._left_s, self._left_chars = EPISODE_TIMEOUT_S, MAX_OUTPUT_CHARS
         try:
-            assert self._process.stdin is not None and self._process.stdout is not None
-            self._input, self._output = self._process.stdin.fileno(), self._process.stdout.fileno()
-            os.set_blocking(self._input, False)
-            self.about = self._ask("load", self._files(id, method), track=track, id=id,
-                                   kwargs=kwargs)[0]
-            """Unchecked attributes that the method's class reports."""
+            self.about = self._ask("load", **self._request)[0]
         except BaseException:
             self.close()
             raise
 
-    def begin(self, random: np.random.Generator | None = None) -> None:
-        """Begin an episode with a new instance of the method; a policy draws from a generator with
-        the state of ``random``."""
+    def __call__(self, task: Any, random: np.random.Generator | None = None) -> Worker:
+        """Begin an episode with a new instance of the method, like its class; a policy draws from a
+        generator with the state of ``random``."""
+        if not self.is_alive:
+            self.start()
         self._left_s, self._left_chars = EPISODE_TIMEOUT_S, MAX_OUTPUT_CHARS
         self._ask("begin", random=None if random is None else random.bit_generator.state)
+        return self
 
     def update(self, voltages: np.ndarray, currents: np.ndarray) -> Any:
         """Return the estimator's `Estimate`, or None, after a measurement."""
         from eitbench.worlds.task import Estimate
-        header, arrays = self._ask("update", {"voltages": voltages, "currents": currents})
-        if header.get("estimate") is None:
+        values, arrays = self._ask("update", voltages=voltages, currents=currents)
+        kind = values.get("estimate")
+        if kind is None:
             return None
-        if header["estimate"] != "Estimate" or not {"mean"} <= set(arrays) <= set(Estimate._fields):
+        if kind != "Estimate" or not {"mean"} <= set(arrays) <= set(Estimate._fields):
             raise WorkerError("ValueError: Estimator.update must return an Estimate or None, got "
-                              f"{_text(header['estimate'])}")
+                              f"{_text(kind)}")
         return Estimate(**arrays)
 
     def act(self, observation: Arrays) -> Any:
         """Return the policy's action."""
-        action = self._ask("act", observation)[1].get("action", np.zeros(0))
+        action = self._ask("act", **observation)[1].get("action", np.zeros(0))
         return int(action) if action.shape == () and action.dtype.kind in "iu" else action
 
     @property
     def is_alive(self) -> bool:
-        """True unless the process ended: after a crash, a limit or a malformed message."""
-        return self._process.poll() is None
+        """True if the process runs; it ends after a crash, a limit or a malformed message."""
+        return self._process is not None and self._process.poll() is None
 
     @property
     def peak_memory(self) -> int | None:
@@ -416,12 +393,10 @@ class Worker:
 
     def close(self) -> None:
         """End the process and its children, and remove its folder."""
-        self._kill()
-        for pipe in (self._process.stdin, self._process.stdout):
-            if pipe:
-                pipe.close()
-        if not self._is_confined:
-            shutil.rmtree(self._home, ignore_errors=True)
+        if self._process is not None:
+            self._kill()
+            self._socket.close()
+            self._folder.cleanup()
 
     def _environment(self) -> dict[str, str]:
         """Return the worker's environment variables, without other variables of this process."""
@@ -434,33 +409,40 @@ class Worker:
             "HOME": str(self._home), "TMPDIR": str(self._home), "PYTHONDONTWRITEBYTECODE": "1",
             CACHE_VARIABLE: str(cache_folder())} | (inside if self._is_confined else {})
 
-    def _files(self, id: str, method: str) -> dict[str, np.ndarray]:
-        """Return as bytes the name of the method, the contents of its files, and the registry entry
-        of an environment that was registered at run time."""
+    def _files(self, id: str, method: str) -> dict[str, Any]:
+        """Return the name of the method, the contents of its files, and the registry entry of an
+        environment that was registered at run time."""
         by_hand = [each for each in runtime_entries() if each.id == id]
-        contents = {"method": str(method).encode(),
-                    "entry": b"".join(map(cloudpickle.dumps, by_hand))}
+        contents = {"entry": b"".join(map(cloudpickle.dumps, by_hand))}
         if is_path(method) and is_builtin(method):
-            contents["method"] = str(Path(method).resolve()).encode()
+            method = str(Path(method).resolve())
         elif is_path(method):
-            files = method_files(Path(method))
+            files = methods.method_files(Path(method))
             contents |= {f"file:{name}": content for name, content in files.items()}
-            contents["method"] = Path(method).name.encode()
+            method = Path(method).name
             self.sha256 = method_sha256(files)
-        return {name: np.frombuffer(content, np.uint8) for name, content in contents.items()}
+        return {"method": method} | {name: np.frombuffer(content, np.uint8)
+                                     for name, content in contents.items()}
 
-    def _ask(self, do: str, arrays: Arrays | None = None, **header: Any,
-             ) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-        """Send a request, one of the methods of `_MethodServer`, and return the reply."""
+    def _ask(self, do: str, **content: Any) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+        """Send a request with the arguments of one of the methods of `_MethodServer`, and return
+        the values and arrays of the reply."""
         begin = time.monotonic()
         self._deadline = begin + self.reply_timeout
         try:
-            self._send(encode_message({"do": do, **header}, arrays))
-            reply, received = decode_message(self._read)
+            self._send(encode_message({"do": do, **content}))
+            reply, arrays = decode_message(self._read)
             self._left_s -= time.monotonic() - begin
             if self._left_s < 0.0:
                 raise WorkerError("TimeoutError: its replies in one episode took more than "
                                   f"{EPISODE_TIMEOUT_S:g} s")
+        except ConnectionError:
+            with suppress(subprocess.TimeoutExpired):
+                self._process.wait(1.0)
+            self._kill()
+            raise WorkerError("ChildProcessError: the worker ended with status "
+                              f"{self._process.returncode}, as after a crash or at a memory limit"
+                              ) from None
         except ValueError as error:
             self._kill()
             raise WorkerError(f"ValueError: {error}") from None
@@ -473,7 +455,7 @@ class Worker:
             failed.where = _text(reply.get("where"))
             failed.traceback = _text(reply.get("traceback"))
             raise failed
-        return reply, received
+        return reply, arrays
 
     def _show(self, printed: str) -> None:
         """Print the method's output, each line prefixed with its name."""
@@ -484,48 +466,41 @@ class Worker:
 
     def _send(self, message: bytes) -> None:
         left = memoryview(message)
-        while left:  # the pipe stays full if the worker does not read
-            self._wait([], [self._input])
-            try:
-                left = left[os.write(self._input, left):]
-            except BrokenPipeError:
-                raise self._ended() from None
+        while left:  # the buffer stays full if the worker does not read
+            self._check_limits()
+            with suppress(TimeoutError):
+                left = left[self._socket.send(left):]
 
     def _read(self, n: int) -> bytes:
         parts = bytearray()
         while len(parts) < n:
-            self._wait([self._output], [])
-            part = os.read(self._output, min(n - len(parts), 1 << 20))
-            if not part:
-                raise self._ended()
-            parts += part
+            self._check_limits()
+            with suppress(TimeoutError):
+                part = self._socket.recv(min(n - len(parts), 1 << 20))
+                if not part:
+                    raise ConnectionError
+                parts += part
         return bytes(parts)
 
-    def _wait(self, readers: list[int], writers: list[int]) -> None:
-        """Wait until a pipe is ready, and check time, memory and number of threads meanwhile."""
-        while True:
-            now = time.monotonic()
-            if now > self._deadline:
-                raise WorkerError(f"TimeoutError: no reply within {self.reply_timeout:g} s")
-            if now > self._next_check:
-                self._check_limits()
-                self._next_check = time.monotonic() + CHECK_INTERVAL_S
-            wait = min(CHECK_INTERVAL_S, self._deadline - now)
-            if any(select.select(readers, writers, [], max(0.0, wait))[:2]):
-                return
-
     def _check_limits(self) -> None:
+        """Raise `WorkerError` after the deadline and, each `CHECK_INTERVAL_S`, if the processes
+        have too much memory or too many threads."""
+        now = time.monotonic()
+        if now > self._deadline:
+            raise WorkerError(f"TimeoutError: no reply within {self.reply_timeout:g} s")
+        if now <= self._next_check:
+            return
         family = self._family()
         if sum(_status(pid, "Threads") for pid in family) > self._limits.threads:
             raise WorkerError(f"ResourceLimitError: it started more than {self._limits.threads} "
                               "processes and threads")
-        if sum(_status(pid, "VmRSS") for pid in family) <= self._limits.memory:
-            return
         # VmRSS counts a shared page once for each process, Pss once in total.
-        if sum(_status(pid, "Pss", "smaps_rollup") or _status(pid, "VmRSS")
-               for pid in family) > self._limits.memory:
+        if sum(_status(pid, "VmRSS") for pid in family) > self._limits.memory and sum(
+                _status(pid, "Pss", "smaps_rollup") or _status(pid, "VmRSS")
+                for pid in family) > self._limits.memory:
             raise WorkerError("ResourceLimitError: it held more than "
                               f"{self._limits.memory >> 20} MiB")
+        self._next_check = time.monotonic() + CHECK_INTERVAL_S
 
     def _family(self) -> list[int]:
         """Return the ids of the process and its descendants; stop soon after the limit is
@@ -540,13 +515,6 @@ class Worker:
                     children = Path(f"/proc/{pid}/task/{thread}/children").read_text()
                     left += map(int, children.split())
         return found
-
-    def _ended(self) -> WorkerError:
-        with suppress(subprocess.TimeoutExpired):
-            self._process.wait(1.0)
-        self._kill()
-        return WorkerError(f"ChildProcessError: the worker ended with status "
-                           f"{self._process.returncode}, as after a crash or at a memory limit")
 
     def _kill(self) -> None:
         """Kill the process and its children; under bubblewrap the kernel ends all processes."""
@@ -584,12 +552,12 @@ def main() -> None:
     while True:
         sys.stdout = sys.stderr = printed = io.StringIO()
         try:
-            header, arrays = decode_message(partial(_read_exactly, incoming), 2 * MAX_ARRAY_BYTES)
+            values, arrays = decode_message(partial(_read_exactly, incoming), 2 * MAX_ARRAY_BYTES)
         except EOFError:
             return
         try:
-            reply, result = getattr(server, header["do"])(header, arrays)
-            message = encode_message(reply | {"printed": _sendable(printed.getvalue())}, result)
+            reply = getattr(server, values.pop("do"))(**values, **arrays)
+            message = encode_message(reply | {"printed": _sendable(printed.getvalue())})
         except (Exception, SystemExit) as error:
             message = encode_message(server.describe(error)
                                      | {"printed": _sendable(printed.getvalue())})
@@ -614,7 +582,8 @@ def _set_limits(limits: Limits) -> None:
     for kind, value in most.items():
         resource.setrlimit(kind, (value, value))
     if sys.platform.startswith("linux"):
-        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0)
+        PR_SET_PDEATHSIG = 1
+        ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0)
 
 
 def _copy_kernels() -> None:
@@ -630,7 +599,7 @@ def _copy_kernels() -> None:
 
 
 class _MethodServer:
-    """Requests that a worker answers; each method returns a header and arrays."""
+    """Requests that a worker answers; each method returns the content of a reply."""
 
     def __init__(self) -> None:
         self._file = Path()
@@ -638,45 +607,41 @@ class _MethodServer:
         self._known: Any = None
         self._instance: Any = None
 
-    def load(self, header: dict[str, Any], arrays: Arrays) -> tuple[dict[str, Any], Arrays]:
+    def load(self, track: str, id: str, kwargs: dict[str, Any], method: str, entry: np.ndarray,
+             **files: np.ndarray) -> dict[str, Any]:
         """Load the method and return the attributes of its class."""
         import gymnasium as gym
-        contents = {name: array.tobytes() for name, array in arrays.items()}
-        method = contents["method"].decode()
-        if contents["entry"]:  # unpickling is safe: the parent process sent it
-            import_entries([cloudpickle.loads(contents["entry"])])
-        home = Path.home() / "method"
-        home.mkdir()
-        for name in (name for name in contents if name.startswith("file:")):
-            file = home / name.removeprefix("file:")
-            file.write_bytes(contents[name])
-            if file.name == method:
-                self._file = file
-        env: Any = gym.make(header["id"], disable_env_checker=True, **header["kwargs"]).unwrapped
-        self._method = load_method(str(self._file) if self._file.name else method, header["track"])
-        self._known = env.task if header["track"] == "estimation" else env.rules
+        if entry.size:  # unpickling is safe: the parent process sent it
+            import_entries([cloudpickle.loads(entry.tobytes())])
+        if files:
+            self._file = Path.home() / "method" / method
+            self._file.parent.mkdir()
+        for name, content in files.items():
+            self._file.with_name(name.removeprefix("file:")).write_bytes(content.tobytes())
+        env: Any = gym.make(id, disable_env_checker=True, **kwargs).unwrapped
+        self._method = load_method(str(self._file) if files else method, track)
+        self._known = env.task if track == "estimation" else env.rules
         attributes = ("name", "title", "subtracks", "parameters", "role", "privileged")
         about = {name: getattr(self._method, name) for name in attributes}
-        return about | {"suits": self._method.suits(self._known)}, {}
+        return about | {"suits": self._method.suits(self._known)}
 
-    def begin(self, header: dict[str, Any], arrays: Arrays) -> tuple[dict[str, Any], Arrays]:
+    def begin(self, random: dict[str, Any] | None) -> dict[str, Any]:
         """Make a new instance of the method."""
-        random = header["random"]
         drawn = [] if random is None else [generator_from_state(random)]
         self._instance = self._method.make(self._known, *drawn)
-        return {}, {}
+        return {}
 
-    def update(self, header: dict[str, Any], arrays: Arrays) -> tuple[dict[str, Any], Arrays]:
+    def update(self, voltages: np.ndarray, currents: np.ndarray) -> dict[str, Any]:
         """Return the estimator's estimate after a measurement."""
-        estimate = self._instance.update(arrays["voltages"], arrays["currents"])
+        estimate = self._instance.update(voltages, currents)
         if not hasattr(estimate, "_asdict"):
-            return {"estimate": None if estimate is None else type(estimate).__name__}, {}
-        given = {name: value for name, value in estimate._asdict().items() if value is not None}
-        return {"estimate": "Estimate"}, {name: np.asarray(value) for name, value in given.items()}
+            return {"estimate": None if estimate is None else type(estimate).__name__}
+        return {"estimate": "Estimate"} | {name: np.asarray(value) for name, value
+                                           in estimate._asdict().items() if value is not None}
 
-    def act(self, header: dict[str, Any], arrays: Arrays) -> tuple[dict[str, Any], Arrays]:
+    def act(self, **observation: np.ndarray) -> dict[str, Any]:
         """Return the policy's action."""
-        return {}, {"action": np.asarray(self._instance.act(arrays))}
+        return {"action": np.asarray(self._instance.act(observation))}
 
     def describe(self, error: BaseException) -> dict[str, str]:
         """Return an error as the header of a reply."""

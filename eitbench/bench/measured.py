@@ -5,7 +5,6 @@ from __future__ import annotations
 import io
 import math
 from collections.abc import Collection, Iterable
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -23,85 +22,76 @@ if TYPE_CHECKING:
 N_PLOTTED_FRAMES = 60
 
 
-@dataclass(frozen=True, eq=False)
 class MeasuredRun:
     """Estimates of a method, and their residuals, t = 1 … T."""
 
-    method: str
-    steps: np.ndarray
-    """(S,) increasing t of the stored estimates"""
-    mean: np.ndarray
-    """(S, n) mol/m³ at the nodes of the task's mesh"""
-    variance: np.ndarray | None
-    """(S, n) (mol/m³)², NaN in states without a variance; None if the last state has none"""
-    nis: np.ndarray
-    """(T,) νᵀS⁻¹ν relative to the number of visible measurements; NaN without an innovation"""
-    withheld_residual_rms: np.ndarray
-    """(T,) RMS residual of withheld measurements relative to the noise; NaN in unscored steps"""
-    velocity: np.ndarray | None
-    """(T, k) m/s, parameters of the flow if estimated; nominal if the method returns none"""
-    frame_times: np.ndarray
-    """(C,) s, start of some frames, evenly distributed"""
-    electrode_residual_rms: np.ndarray
-    """(C, L) RMS residual in a frame relative to the noise, over the measurements that involve the
-    electrode while it drives current (without any in all frames, over all that involve it), of
-    the estimate before each measurement; for a stationary target, of the last. NaN without any."""
-    seconds_per_step: float
-    withheld_rmse_volts: float = math.nan
-    """V, RMS residual of all withheld readings that are scored"""
-
-    @property
-    def withheld_rmse(self) -> float:
-        """RMS residual of all scored withheld measurements relative to the noise; NaN without
-        any."""
-        return _root_mean(self.withheld_residual_rms**2)
-
-    def mean_nis(self, warm_up: int) -> float | None:
-        """Mean NIS/m after the warm-up; None if the method has no innovations."""
-        nis = self.nis[warm_up:]
-        known = np.isfinite(nis)
-        return float(nis[known].mean()) if known.any() else None
-
-    @classmethod
-    def collect(cls, env: MeasuredEnv, method: str,
-                steps: Iterable[tuple[int, Estimate | None, dict[str, np.ndarray], float]],
-                kept: Collection[int] | None = None) -> MeasuredRun:
+    def __init__(self, env: MeasuredEnv, method: str,
+                 steps: Iterable[tuple[int, Estimate | None, dict[str, np.ndarray], float]],
+                 kept: Collection[int] | None = None) -> None:
         """Collect (t, estimate, measurement, seconds) step by step; store the estimates at the
         steps ``kept``, by default all."""
         T, velocity = env.episode_steps, env.task.velocity
-        residual, squares, nis = np.full((3, T), np.nan)
-        theta = None if velocity is None else np.tile(velocity.nominal, (T, 1))
+        self.method = method
+        self.nis = np.full(T, np.nan)
+        """(T,) νᵀS⁻¹ν relative to the number of visible measurements; NaN without an innovation"""
+        self.withheld_residual_rms = np.full(T, np.nan)
+        """(T,) RMS residual of withheld measurements relative to the noise; NaN in unscored
+        steps"""
+        self.velocity = None if velocity is None else np.tile(velocity.nominal, (T, 1))
+        """(T, k) m/s, parameters of the flow if estimated; nominal if the method returns none"""
+        squares = np.full(T, np.nan)
         electrodes = _ElectrodeResiduals(env)
         at_rest = isinstance(env.task.transport, StationaryTransport)
-        estimates: dict[int, Estimate] = {}
+        stored: dict[int, tuple[np.ndarray, np.ndarray | None]] = {}
         seconds = 0.0
         mean = before = np.empty(0)
         for t, estimate, _, elapsed in steps:
             assert estimate is not None
             seconds += elapsed
             mean = np.array(estimate.mean, dtype=float)
-            nis[t - 1] = _nis(env, t, estimate)
-            if theta is not None and estimate.velocity is not None:
-                theta[t - 1] = estimate.velocity
+            self.nis[t - 1] = _nis(env, t, estimate)
+            if self.velocity is not None and estimate.velocity is not None:
+                self.velocity[t - 1] = estimate.velocity
             for scored in env.scoring_steps(t):
                 relative, volts = env.withheld_residuals(scored, mean)
                 if len(relative):
-                    residual[scored - 1] = np.sqrt(np.mean(relative**2))
+                    self.withheld_residual_rms[scored - 1] = np.sqrt(np.mean(relative**2))
                     squares[scored - 1] = np.mean(volts**2)
             if not at_rest:
                 electrodes.add(t, before if t > 1 else mean)
             before = mean
             if kept is None or t in kept:
-                variance = None if estimate.variance is None else np.array(estimate.variance)
-                estimates[t] = estimate._replace(mean=mean, variance=variance, innovation=None,
-                                                 innovation_covariance=None)
+                stored[t] = mean, None if estimate.variance is None else np.array(estimate.variance)
         if at_rest:
             for t in range(1, T + 1):
                 electrodes.add(t, mean)
-        return cls(method, np.array(list(estimates)),
-                   np.array([each.mean for each in estimates.values()]),
-                   _variances(list(estimates.values())), nis, residual, theta, electrodes.times,
-                   electrodes.rms(), seconds / T, _root_mean(squares))
+        variances = [variance for _, variance in stored.values()]
+        self.steps = np.array(list(stored))
+        """(S,) increasing t of the stored estimates"""
+        self.mean = np.array([each for each, _ in stored.values()])
+        """(S, n) mol/m³ at the nodes of the task's mesh"""
+        self.variance = None if not variances or variances[-1] is None else np.array(
+            [np.full(len(mean), np.nan) if each is None else each for each in variances])
+        """(S, n) (mol/m³)², NaN in states without a variance; None if the last state has none"""
+        self.frame_times = electrodes.times
+        """(C,) s, start of some frames, evenly distributed"""
+        self.electrode_residual_rms = electrodes.rms()
+        """(C, L) RMS residual in a frame relative to the noise, over the measurements that involve
+        the electrode while it drives current (without any in all frames, over all that involve
+        it), of the estimate before each measurement; for a stationary target, of the last. NaN
+        without any."""
+        self.seconds_per_step = seconds / T
+        self.withheld_rmse = _root_mean(self.withheld_residual_rms**2)
+        """RMS residual of all scored withheld measurements relative to the noise; NaN without
+        any"""
+        self.withheld_rmse_volts = _root_mean(squares)
+        """the same in V"""
+
+    def mean_nis(self, warm_up: int) -> float | None:
+        """Mean NIS/m after the warm-up; None if the method has no innovations."""
+        nis = self.nis[warm_up:]
+        known = np.isfinite(nis)
+        return float(nis[known].mean()) if known.any() else None
 
     def outcome(self, env: MeasuredEnv) -> Outcome:
         """Return the data for scores: withheld residuals, NIS and the KTC score of a case."""
@@ -171,13 +161,6 @@ def plotted_steps(env: MeasuredEnv) -> set[int]:
     first = min(env.task.warm_up + 1, env.episode_steps)
     steps = np.linspace(first, env.episode_steps, N_PLOTTED_FRAMES).round().astype(int)
     return set(steps.tolist())
-
-
-def _variances(estimates: list[Estimate]) -> np.ndarray | None:
-    if not estimates or estimates[-1].variance is None:
-        return None
-    missing = np.full(len(estimates[-1].mean), np.nan)
-    return np.array([missing if each.variance is None else each.variance for each in estimates])
 
 
 def _nis(env: MeasuredEnv, t: int, estimate: Estimate) -> float:

@@ -27,11 +27,8 @@ def shared_ranks(scores: Mapping[str, Scores], unranked: Collection[str] = (), *
     better side. Rank 1 means that no method is significantly better, rank 3 that two are. A method
     with too few episodes for an interval does not affect the ranks of others.
 
-    The absence of a significant difference is not transitive: it may hold for a and b, and for b
-    and c, while a is significantly better than c; a and b then have rank 1 and c rank 2. Ranks need
-    not increase with the statistic: a method whose scores vary much may have a worse mean than a
-    method of rank 2 and still have rank 1. Each comparison is at 95 %, without correction for the
-    number of comparisons.
+    Ranks need not increase with the statistic. Each comparison is at 95 %, without correction for
+    the number of comparisons (``docs/statistics.md``).
 
     Parameters
     ----------

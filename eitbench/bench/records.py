@@ -16,11 +16,9 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-import os
 import re
-import stat
 import warnings
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from functools import lru_cache
 from itertools import islice
@@ -39,9 +37,9 @@ from eitbench.data.seeds import format_seed, parse_seeds
 
 SCHEMA = 3
 BOARDS = tracks.ALL_SUBTRACKS
-COMMON_FIELDS = ("board", "title", "parameters", "role", "privileged", "version", "method_sha256",
-          "checkpoint_sha256")
-"""Fields that all episodes of a record share, in addition to environment and method."""
+COMMON_FIELDS = ("environment", "method", "board", "title", "parameters", "role", "privileged",
+                 "version", "method_sha256", "checkpoint_sha256")
+"""Fields that all episodes of a record share."""
 MAX_BYTES = 2**23
 """size of a file"""
 MAX_RECORD_DEPTH = 32
@@ -94,8 +92,7 @@ def read_json(path: Path) -> Any:
     """Read the JSON of a file; ``ValueError``, without the file's name, if it is too large, nested
     too deeply, not UTF-8, or has a number that is not finite (NaN, Infinity, 1e999)."""
     try:
-        status = os.stat(path)
-        if not stat.S_ISREG(status.st_mode) or status.st_size > MAX_BYTES:
+        if path.stat().st_size > MAX_BYTES or not path.is_file():
             raise ValueError(f"it must be a file of at most {MAX_BYTES >> 20} MiB")
         content = orjson.loads(path.read_bytes())
         _check.depth("lists and objects", content, MAX_RECORD_DEPTH)
@@ -104,10 +101,9 @@ def read_json(path: Path) -> Any:
     return content
 
 
-def read_records(folder: Path, *, keep: Callable[[dict[str, Any]], Any] = dict) -> list[Any]:
+def read_records(folder: Path) -> list[dict[str, Any]]:
     """Read all records of a folder, sorted by file name; an empty list if the folder is missing.
     Records of an environment that is not registered in that version are skipped with a warning.
-    ``keep`` may reduce each record as soon as it is read.
 
     If the folder is missing, but the table of its episodes exists next to it, as in an installed
     package, the records come from the table, without runs and errors of single steps.
@@ -116,18 +112,18 @@ def read_records(folder: Path, *, keep: Callable[[dict[str, Any]], Any] = dict) 
     """
     folder = Path(folder)
     if not folder.is_dir() and (table := table_path(folder)).is_file():
-        return [keep(record) for record in read_episode_table(table)]
-    records, complaints = read_valid_files(folder, keep=keep)
+        return read_episode_table(table)
+    records, complaints = read_valid_files(folder)
     if complaints:
         raise ValueError("; ".join(complaints))
     return list(records.values())
 
 
-def read_valid_files(folder: Path, *, keep: Callable[[dict[str, Any]], Any] = dict,
-                     measured: bool = False) -> tuple[dict[Path, Any], list[str]]:
+def read_valid_files(folder: Path, *, measured: bool = False,
+                     ) -> tuple[dict[Path, dict[str, Any]], list[str]]:
     """Return path -> record for the valid records of a folder, and an error message for each other
     file; with ``measured`` only for records of measured cases, else only for others."""
-    kept = {}
+    valid = {}
     complaints = []
     known = set(tracks.measured_ids() if measured else tracks.ids())
     for path in sorted(Path(folder).glob("*.json")):
@@ -140,11 +136,11 @@ def read_valid_files(folder: Path, *, keep: Callable[[dict[str, Any]], Any] = di
             continue
         id = record["environment"]["id"]
         if id in known:
-            kept[path] = keep(record)
+            valid[path] = record
         else:
             warnings.warn(f"record {sanitize(str(path))} is left out: unknown environment "
                           f"{sanitize(id)}", stacklevel=3)
-    return kept, complaints
+    return valid, complaints
 
 
 def record_file_name(record: dict[str, Any]) -> str:
@@ -155,9 +151,8 @@ def record_file_name(record: dict[str, Any]) -> str:
 
 def with_content_hash(record: dict[str, Any]) -> dict[str, Any]:
     """Return the record with the ``sha256`` of its content: canonical JSON of all other fields."""
-    content = {key: value for key, value in record.items() if key != "sha256"}
     try:
-        content = json.loads(_json(content))
+        content = json.loads(_json(record))
         return content | {"sha256": _digest(content)}
     # NaN, a type that JSON does not have, or too deep
     except (TypeError, ValueError, RecursionError) as error:

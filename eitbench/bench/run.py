@@ -18,17 +18,9 @@ from threadpoolctl import threadpool_limits
 from tqdm import tqdm
 
 from eitbench._sanitize import error_location, user_traceback
-from eitbench.bench import isolation
-from eitbench.bench.isolation import WorkerError, load_isolated
-from eitbench.bench.methods import (
-    Method,
-    find_method,
-    load_method,
-    loader_of,
-    method_files,
-    method_sha256,
-    version_of,
-)
+from eitbench.bench import isolation, methods
+from eitbench.bench.isolation import WorkerError
+from eitbench.bench.methods import Method
 from eitbench.bench.records import COMMON_FIELDS
 from eitbench.bench.runner import cached_environment, run_method
 from eitbench.bench.scores import SCORING, compute_scores
@@ -40,9 +32,6 @@ from eitbench.data.parallel import run_parallel
 from eitbench.data.seeds import format_seed
 from eitbench.measured.cases import read_case
 from eitbench.worlds.registry import entry
-
-_INVARIANT_FIELDS = ("environment", "method", *COMMON_FIELDS)
-"""Fields of a result that a method may not change during a run."""
 
 
 class Job(NamedTuple):
@@ -60,34 +49,27 @@ class Job(NamedTuple):
         """Load the method."""
         track = self.environment.track
         if self.isolation != "none":
-            return load_isolated(track, self.environment.id, self.environment.kwargs, self.method,
-                                 self.isolation)
+            return isolation.load_isolated(track, self.environment.id, self.environment.kwargs,
+                                           self.method, self.isolation)
         with redirect_stdout(sys.stderr):
-            return load_method(self.method, track)
+            return methods.load_method(self.method, track)
 
     def identity(self) -> str:
         """Return a digest of the configuration and declared versions that determine the outcome; a
         stored result is reused only if the digests are equal. The method is not loaded.
         ``ValueError`` for an unknown method or environment."""
-        path = find_method(self.method, self.environment.track)
-        contents = method_files(path)
+        path = methods.find_method(self.method, self.environment.track)
+        contents = methods.method_files(path)
         files = {name: hashlib.sha256(content).hexdigest() for name, content in contents.items()
                  if name != "sha256"}
-        arguments = self.environment.arguments
-        world = arguments.pop("world", None)
-        parts = {"environment": self.environment.id, "arguments": arguments,
-                 "world": _content_digest(self.environment.id, world), "files": files,
-                 "loader": loader_of(path),
-                 "version": version_of(path, method_sha256(contents)), "seed": self.seed,
-                 "scoring": SCORING}
+        id, arguments = self.environment.id, self.environment.arguments
+        changes = arguments.pop("world", None)
+        world = (read_case(registered_kwargs(id)["case"]).digest if is_measured(id)
+                 else world_digest(entry(id).world.with_changes(changes)))
+        parts = {"environment": id, "arguments": arguments, "world": world, "files": files,
+                 "loader": methods.loader_of(path), "seed": self.seed, "scoring": SCORING,
+                 "version": methods.version_of(path, methods.method_sha256(contents))}
         return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()[:16]
-
-
-def _content_digest(id: str, changes: dict[str, Any] | None) -> str:
-    """Return the digest of an environment's world with ``changes``, or of its measured case."""
-    if is_measured(id):
-        return read_case(registered_kwargs(id)["case"]).digest
-    return world_digest(entry(id).world.with_changes(changes))
 
 
 def run_episode(job: Job) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
@@ -209,7 +191,7 @@ def _run_job(job: Job, store: EpisodeStore, run: dict[str, Any], home: str,
              beginning: dict[str, Any], keep_estimates: bool) -> None:
     try:
         result, fields = run_episode(job)
-        if any(result[name] != beginning[name] for name in _INVARIANT_FIELDS):
+        if any(result[name] != beginning[name] for name in COMMON_FIELDS):
             raise ValueError(f"{job.method}: metadata changed between episodes")
         # the identity of a world defined in a script depends on the script, unknown in this process
         result["identity"] = beginning["identity"]
@@ -220,7 +202,7 @@ def _run_job(job: Job, store: EpisodeStore, run: dict[str, Any], home: str,
     elsewhere = {} if platform.node() == home else {"machine": machine()}
     result["run"] = run | elsewhere | {"isolation": job.isolation}
     try:
-        store.put(job.environment.name, result["method"], job.seed, result, fields)
+        store.put(result, fields)
     except OSError:
         isolation.close()  # the worker's folder may fill the disk
-        store.put(job.environment.name, result["method"], job.seed, result, fields)
+        store.put(result, fields)

@@ -1,10 +1,11 @@
-"""Run methods on episodes, step by step or as a whole."""
+"""Run methods on episodes, step by step or as a whole. Estimates are scored on the truth mesh
+(``docs/methods.md``, 4)."""
 
 from __future__ import annotations
 
 import json
 import time
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -12,20 +13,17 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 from tqdm import tqdm
 
-from eitbench import _check
+from eitbench import _check, scoring
 from eitbench.bench.measured import MeasuredRun
 from eitbench.bench.methods import Method, load_method
-from eitbench.bench.outcomes import (
-    EstimatorOutput,
-    ScoredEstimate,
-    estimation_outcome,
-    injection_outcome,
-)
 from eitbench.bench.scores import Outcome
 from eitbench.bench.tracks import Environment, check_track, is_measured, subtrack_of
+from eitbench.data.episode_cache import region_operators
+from eitbench.data.episodes import cached_truth_model, simulate
 from eitbench.data.seeds import allow_test_seeds
 from eitbench.envs.estimation import EstimationEnv
 from eitbench.envs.injection import InjectionEnv
+from eitbench.estimation import best_homogeneous
 from eitbench.estimation.walk import RandomWalk
 from eitbench.physics.stationary import StationaryTransport
 from eitbench.worlds.random_streams import episode_streams, generator_from_state
@@ -35,6 +33,9 @@ from eitbench.worlds.world import World
 
 if TYPE_CHECKING:
     from eitbench.envs.measured import MeasuredEnv
+
+Step = tuple[int, Estimate | None, dict[str, np.ndarray], float]
+"""t of an estimate, the estimate, the last measurement, and the estimator's time in s."""
 
 
 class EpisodeRun(NamedTuple):
@@ -105,7 +106,7 @@ def run_on_measurements(env: MeasuredEnv, method: str | Method, seed: int = 0, *
     with threadpool_limits(1):
         steps = tqdm(_iter_steps(env, method, seed), total=env.episode_steps, desc=method.name,
                      unit="measurement", disable=None, leave=False)
-        return MeasuredRun.collect(env, method.name, steps, kept)
+        return MeasuredRun(env, method.name, steps, kept)
 
 
 def _motion(task: Task) -> str:
@@ -118,34 +119,124 @@ def _motion(task: Task) -> str:
 
 def run_estimator(env: EstimationEnv, estimator: Method, seed: int) -> EpisodeRun:
     """Run an estimator on one episode."""
-    said = EstimatorOutput.collect(env.task, _iter_steps(env, estimator, seed))
-    return EpisodeRun(estimation_outcome(env, said), said.currents, said.fields())
+    output = EstimatorOutput(env.task, _iter_steps(env, estimator, seed))
+    return EpisodeRun(output.outcome(env), output.currents, output.fields())
+
+
+class EstimatorOutput:
+    """Outputs and inputs of an estimator in one episode of T steps, collected step by step."""
+
+    def __init__(self, task: Task, steps: Iterable[Step]) -> None:
+        self.means = np.full((task.n_steps, task.mesh.n_nodes), np.nan)
+        """(T, n) mol/m³ for t = 1 … T"""
+        self.variances = self.means.copy()
+        """(T, n) (mol/m³)², NaN in states without a variance"""
+        self.velocities = np.tile(task.velocity.nominal if task.velocity else (),
+                                  (task.n_steps, 1))
+        """(T, k) parameters of the flow in m/s; k = 0 if the task specifies the flow"""
+        self.innovations: dict[int, tuple[np.ndarray, np.ndarray]] = {}
+        """measurement i -> (ν, S)"""
+        self.seconds: list[float] = []
+        """time of each update; the first includes the constructor"""
+        measured = []
+        for t, estimate, measurement, elapsed in steps:
+            measured.append(measurement)
+            self.seconds.append(elapsed)
+            if estimate is None:
+                continue
+            if t >= 1:
+                self.means[t - 1] = estimate.mean
+                if estimate.variance is not None:
+                    self.variances[t - 1] = estimate.variance
+                if estimate.velocity is not None:
+                    self.velocities[t - 1] = estimate.velocity
+            if estimate.innovation is not None and estimate.innovation_covariance is not None:
+                # copies: a method may reuse its arrays
+                self.innovations[t + task.lag] = (
+                    np.array(estimate.innovation, dtype=float),
+                    np.array(estimate.innovation_covariance, dtype=float))
+        self.voltages, self.currents = (
+            np.array([each[key] for each in measured[:task.n_steps]])
+            for key in ("voltages", "currents"))
+        """(T, L) V, and A"""
+        self.has_std = bool(np.isfinite(self.variances[task.warm_up:]).all())
+        """True if every scored state has a variance"""
+
+    def fields(self) -> dict[str, np.ndarray]:
+        """Return means and standard deviations as float32, for figures."""
+        fields = {"mean": self.means}
+        if self.has_std:
+            fields["std"] = np.sqrt(self.variances)
+        if self.velocities.size:
+            fields["velocity"] = self.velocities
+        return {name: each.astype(np.float32) for name, each in fields.items()}
+
+    def outcome(self, env: EstimationEnv) -> Outcome:
+        """Return the outcome of the episode that has just ended in ``env``."""
+        task = env.task
+        interpolation, mass = region_operators(env.world)
+        states = slice(task.warm_up, None)
+        truth = env.truth()[states]
+        mean = (interpolation @ self.means[states].T).T
+        std = (interpolation @ np.sqrt(self.variances[states]).T).T if self.has_std else None
+        homogeneous = best_homogeneous(task.observation, task.noise, task.mesh.n_nodes,
+                                       self.voltages, self.currents, task.expected_concentration)
+        computed = np.array([
+            task.observation.voltages(estimate, current[None])[0]
+            for estimate, current in zip(self.means[states], self.currents[states], strict=True)])
+        velocity = None
+        if task.velocity is not None:
+            velocity = (self.velocities[states] @ task.velocity.profiles.T,
+                        env.true_velocity()[states], task.velocity.weights)
+        # all steps or none: a method must not select the steps that fit
+        steps = range(task.warm_up + 1, task.n_steps + 1)
+        innovations = None
+        if all(i in self.innovations for i in steps):
+            innovations = (np.array([self.innovations[i][0] for i in steps]),
+                           np.array([self.innovations[i][1] for i in steps]))
+        return Outcome(
+            env.world, sum(self.seconds) / task.n_steps, scoring.step_errors(mean, truth, mass),
+            mean=mean, truth=truth, mass=mass,
+            points=cached_truth_model(env.world).transport.mesh.points, homogeneous=homogeneous,
+            voltages_measured=self.voltages[states], voltages_predicted=computed,
+            innovations=innovations, std=std, velocity=velocity)
 
 
 def _run_policy(env: InjectionEnv, policy: Method, seed: int) -> EpisodeRun:
     seconds = 0.0
     currents = list[np.ndarray]()
-    claims = list[ScoredEstimate]()
     actions = list[Any]()
+    scored = list[tuple[Any, ...]]()
     # `iter_injections` does not measure the time of this loop's body
     total = 0.0
-    for t, observation, elapsed, reward in iter_injections(env, policy, seed, actions):
+    for t, observation, elapsed, action, reward in iter_injections(env, policy, seed):
         seconds += elapsed
         total += reward
         currents.append(observation["currents"])
+        actions.append(action)
         if (error := env.error) is not None:
             means, stds = env.core.estimate()
-            claims.append(ScoredEstimate(t, error, means[0], stds[0], env.core.innovations()[0]))
-    spent = sum(bool(each.any()) for each in currents)
-    outcome = injection_outcome(env.core.world, seed, claims, seconds / env.core.length, spent)
+            scored.append((t, error, means[0], stds[0], env.core.innovations()[0]))
+    states, errors, mean, std, innovations = zip(*scored, strict=True)
+    world = env.core.world
+    interpolation, mass = region_operators(world)
+    used = [each for each in innovations if each is not None]       # None: all were rejected
+    outcome = Outcome(
+        world, seconds / env.core.length, np.array(errors),
+        n_injections=sum(bool(each.any()) for each in currents),
+        mean=(interpolation @ np.array(mean).T).T, std=(interpolation @ np.array(std).T).T,
+        truth=simulate(world, seed, progress=False).concentration[list(states)].astype(float),
+        mass=mass, points=cached_truth_model(world).transport.mesh.points,
+        innovations=([each.value for each in used],
+                     [each.covariance for each in used]) if used else None)
     return EpisodeRun(outcome, np.array(currents), {}, actions, total)
 
 
-def iter_injections(env: InjectionEnv, policy: Method, seed: int, actions: list[Any] | None = None,
-               ) -> Iterator[tuple[int, dict[str, np.ndarray], float, float]]:
-    """Yield (t of the observed state, observation, seconds of the policy, reward) after each
-    injection of one episode. The first time includes the policy's constructor. Actions are appended
-    to ``actions``. Errors as in `run_method`."""
+def iter_injections(env: InjectionEnv, policy: Method, seed: int,
+                    ) -> Iterator[tuple[int, dict[str, np.ndarray], float, Any, float]]:
+    """Yield (t of the observed state, observation, seconds of the policy, its action, JSON-ready,
+    and the reward) after each injection of one episode. The first time includes the policy's
+    constructor. Errors as in `run_method`."""
     if not policy.suits(env.rules):
         raise ValueError(f"policy {policy.name} does not suit {env.spec.id if env.spec else env}")
     with allow_test_seeds():
@@ -159,10 +250,8 @@ def iter_injections(env: InjectionEnv, policy: Method, seed: int, actions: list[
         action = player.act(observation)
         seconds = time.perf_counter() - begin
         observation, reward, done, _, _ = env.step(action)
-        if actions is not None:
-            actions.append(np.asarray(action).tolist())
         t += 1
-        yield t, observation, seconds, float(reward)
+        yield t, observation, seconds, np.asarray(action).tolist(), float(reward)
         begin = time.perf_counter()
 
 
@@ -183,7 +272,7 @@ def iter_estimates(env: EstimationEnv, estimator: Method,
 
 
 def _iter_steps(env: EstimationEnv | MeasuredEnv, estimator: Method, seed: int,
-               ) -> Iterator[tuple[int, Estimate | None, dict[str, np.ndarray], float]]:
+                ) -> Iterator[Step]:
     """Yield (t = i − lag, estimate, measurement i, seconds of the estimator) at each step i."""
     with allow_test_seeds():
         observation, _ = env.reset(seed=seed)

@@ -135,7 +135,6 @@ def paired_difference(a: Scores, b: Scores, *, statistic: Statistic = mean_over_
 
 
 def paired_probability_of_improvement(a: Scores, b: Scores, *, higher_is_better: bool = False,
-                                      n_resamples: int = N_RESAMPLES, seed: int = 0,
                                       ) -> tuple[float, float, float]:
     """Compute the fraction of the shared episodes in which a is better than b, with its 95 %
     interval; an equal score counts ½.
@@ -146,8 +145,7 @@ def paired_probability_of_improvement(a: Scores, b: Scores, *, higher_is_better:
     sign = 1.0 if higher_is_better else -1.0
     wins = {str(i): 0.5 * (1.0 + sign * np.sign(ours - theirs))
             for i, (ours, theirs) in enumerate(zip(*_shared(a, b), strict=True))}
-    value, low, high = stratified_bootstrap(wins, mean_over_environments,
-                                            n_resamples=n_resamples, seed=seed)
+    value, low, high = stratified_bootstrap(wins, mean_over_environments)
     return value, max(low, 0.0), min(high, 1.0)
 
 

@@ -40,10 +40,6 @@ from eitbench.data.seeds import format_seed
 PACKAGES = ("eitbench", "numpy", "scipy", "gymnasium", "scikit-fem", "numba", "stable-baselines3",
             "sb3-contrib", "torch")
 """Packages whose versions are part of a record."""
-_OF_ALL = ("environment", "method", *COMMON_FIELDS)
-"""Fields of a record that have one value for all its episodes."""
-_LOCAL = ("traceback",)
-"""Fields of an episode result that are not copied into a record."""
 _OUTPUTS = ("--out", "-o", "--to")
 """Command-line options for output folders, which do not affect scores."""
 
@@ -60,13 +56,12 @@ class EpisodeStore:
     def __init__(self, folder: Path) -> None:
         self.folder = Path(folder).absolute()           # workers may have other working folders
 
-    def put(self, environment: str, method: str, seed: int, result: dict[str, Any],
-            fields: dict[str, np.ndarray]) -> None:
+    def put(self, result: dict[str, Any], fields: dict[str, np.ndarray]) -> None:
         """Store the ``result`` and the estimates ``fields`` of one episode.
 
         The estimates are written first, so that each stored result has its estimates.
         """
-        path = self._path(environment, method, format_seed(seed))
+        path = self._path(result["environment"]["name"], result["method"], result["seed"])
         if fields:
             content = io.BytesIO()
             np.savez_compressed(content, **fields)  # type: ignore[arg-type]
@@ -93,16 +88,13 @@ class EpisodeStore:
             except ValueError as error:
                 warnings.warn(f"{sanitize(str(path))} is left out: it {error}", stacklevel=2)
 
-    def tracebacks(self, record: dict[str, Any]) -> dict[str, str]:
-        """Map the seed of each failed episode of a record to its traceback, restricted to the
-        method's file; empty if it is not stored."""
-        environment, method = record["environment"]["name"], record["method"]
-        failed = [episode["seed"] for episode in record["episodes"] if episode["status"] != "ok"]
-        texts = dict.fromkeys(failed, "")
-        for seed in failed:
-            with suppress(ValueError):
-                texts[seed] = str(_read(self._path(environment, method, seed)).get("traceback", ""))
-        return texts
+    def traceback(self, record: dict[str, Any], seed: str) -> str:
+        """Return the traceback of a failed episode of a record, restricted to the method's file;
+        empty if it is not stored."""
+        path = self._path(record["environment"]["name"], record["method"], seed)
+        with suppress(ValueError):
+            return str(_read(path).get("traceback", ""))
+        return ""
 
     def fields(self, result: dict[str, Any]) -> dict[str, np.ndarray]:
         """Read the estimates of a result: ``mean`` and optionally ``std``, (T, n) in mol/m³ for T
@@ -203,16 +195,17 @@ def _gathered(results: list[dict[str, Any]]) -> dict[str, Any]:
     place = {run: i for i, run in enumerate(runs)}
     return with_content_hash({
         "schema": SCHEMA, "official": False, "split": split_of(latest["seed"]),
-        **{key: latest[key] for key in _OF_ALL},
+        **{key: latest[key] for key in COMMON_FIELDS},
         "seeds": [result["seed"] for result in results], "runs": list(runs.values()),
-        "episodes": [{key: value for key, value in result.items() if key not in _OF_ALL + _LOCAL}
-                     | {"run": place[run]} for result, run in zip(results, texts, strict=True)],
+        "episodes": [{key: value for key, value in result.items()
+                      if key not in (*COMMON_FIELDS, "traceback")} | {"run": place[run]}
+                     for result, run in zip(results, texts, strict=True)],
     })
 
 
 def record_results(record: dict[str, Any]) -> list[dict[str, Any]]:
     """Convert a record to episode results, as `EpisodeStore.results` yields them."""
-    shared = {key: record[key] for key in _OF_ALL if key in record}
+    shared = {key: record[key] for key in COMMON_FIELDS if key in record}
     runs = record.get("runs", [])
     return [episode | shared | ({"run": runs[episode["run"]]} if runs else {})
             for episode in record["episodes"]]
@@ -261,10 +254,7 @@ def provenance() -> dict[str, Any]:
 def portable_command(command: str) -> str:
     """Return a command without machine-specific paths: options for output folders are removed, and
     other paths that are absolute or contain ``..`` are reduced to their last component."""
-    try:
-        words = iter(shlex.split(command))
-    except ValueError:                                # an unbalanced quote
-        words = iter(command.split())
+    words = iter(shlex.split(command))
     kept = []
     for word in words:
         option, equals, value = word.partition("=")
@@ -283,18 +273,16 @@ def _portable(word: str) -> str:
 @lru_cache(maxsize=1)
 def machine() -> dict[str, Any]:
     """Return processor, number of cores, operating system and speed of the machine of this process;
-    in a cluster it may differ from the machine that started the run."""
-    return {"processor": _processor(), "cores": os.cpu_count(), "system": platform.system(),
-            "blas_threads": 1, "matmul_seconds": matmul_seconds()}
+    in a cluster it may differ from the machine that started the run.
 
-
-@lru_cache(maxsize=1)
-def matmul_seconds() -> float:
-    """Return the time in s of a product of two 1000 × 1000 matrices in double precision on one
-    thread (median of three). Computing times relative to it can be compared between machines."""
+    The speed is the time in s of a product of two 1000 × 1000 matrices in double precision on one
+    thread (median of three). Computing times relative to it can be compared between machines.
+    """
     a, b = np.random.default_rng(0).normal(size=(2, 1000, 1000))
     with threadpool_limits(1):
-        return float(np.median(timeit.repeat(lambda: a @ b, number=1, repeat=3)))
+        seconds = timeit.repeat(lambda: a @ b, number=1, repeat=3)
+    return {"processor": _processor(), "cores": os.cpu_count(), "system": platform.system(),
+            "blas_threads": 1, "matmul_seconds": float(np.median(seconds))}
 
 
 def _version(package: str) -> str | None:

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from eitbench.bench import runner
+from eitbench.bench import tracks
 from eitbench.bench.isolation import choose_isolation
 from eitbench.bench.methods import (
     METHOD_KINDS,
@@ -19,16 +19,8 @@ from eitbench.bench.methods import (
     is_path,
 )
 from eitbench.bench.run import Job
-from eitbench.bench.runner import is_compatible
-from eitbench.bench.tracks import (
-    ONBOARD_FILTERS,
-    QUICK_IDS,
-    Environment,
-    check_track,
-    default_seeds,
-    ids,
-    subtrack_of,
-)
+from eitbench.bench.runner import cached_environment, is_compatible
+from eitbench.bench.tracks import Environment
 
 TOO_SLOW_FOR_QUICK = {("filter", "gauss_newton")}
 """Subtrack and method that the quick suite skips: an episode takes minutes."""
@@ -47,35 +39,36 @@ def make_jobs(track: str, environments: list[str], methods: list[str],
     `isolation.choose_isolation`. ``ValueError`` if an environment or method is unknown, a given
     method is compatible with none of the environments, or two methods have the same name.
     """
-    if estimator not in ONBOARD_FILTERS:
-        raise ValueError(f"estimator must be one of {', '.join(ONBOARD_FILTERS)}, got "
+    if estimator not in tracks.ONBOARD_FILTERS:
+        raise ValueError(f"estimator must be one of {', '.join(tracks.ONBOARD_FILTERS)}, got "
                          f"{estimator!r}")
     given = {} if estimator == "full" else {"estimator": estimator}
     for method in methods:
         find_method(method, track)
     if not environments:
         quick = track == "estimation" and suite == "quick"
-        environments = list(QUICK_IDS) if quick else ids(track)
+        environments = list(tracks.QUICK_IDS) if quick else tracks.ids(track)
     todo = []
-    names = dict[str, str]()
     fitting = set[str]()
     for id, changes in itertools.product(environments, worlds):
-        check_track(id, track)
+        tracks.check_track(id, track)
         asked = Environment(id, json.dumps(given | ({"world": changes} if changes else {})))
         env = _probe_environment(asked)
-        board = subtrack_of(env)
-        numbers = default_seeds(id, suite) if seeds is None else seeds
+        board = tracks.subtrack_of(env)
+        numbers = tracks.default_seeds(id, suite) if seeds is None else seeds
+        names = dict[str, str]()
         # environment by environment: models are cached for a few only, and a worker serves one
         # method
         for method in methods or [*builtin_methods(track), *builtin_agents(id)]:
             skipped = suite == "quick" and not methods and (board, method) in TOO_SLOW_FOR_QUICK
             job = isolated_job(asked, method, isolate, strict)
             loaded = job.load()
-            names[method] = loaded.name
+            if (other := names.setdefault(loaded.name, method)) != method:
+                raise ValueError(f"{other} and {method} have the same name, under which results "
+                                 "are stored; rename one")
             if not skipped and is_compatible(loaded, env):
                 fitting.add(method)
                 todo += [job._replace(seed=seed) for seed in numbers]
-    _check_unique_names(names)
     if missing := [method for method in methods if method not in fitting]:
         raise ValueError(f"{METHOD_KINDS[track].kind} {', '.join(missing)} suits none of the "
                          f"environments {', '.join(environments)}; see `eitbench list`")
@@ -86,7 +79,8 @@ def isolated_job(environment: Environment, method: str, isolate: str,
                  strict: bool = False) -> Job:
     """Return the job of a method, given by name or path; see `isolation.choose_isolation`."""
     kind = choose_isolation(environment, method, isolate, strict=strict)
-    return Job(environment, _absolute(method), 0, kind)
+    path = installed_methods().get(method, Path(method))
+    return Job(environment, str(path.absolute()) if is_path(str(path)) else method, 0, kind)
 
 
 def _probe_environment(asked: Environment) -> Any:
@@ -94,19 +88,4 @@ def _probe_environment(asked: Environment) -> Any:
     if asked.track == "injection":
         kwargs = json.loads(asked.kwargs) | {"estimator": "reduced"}
         asked = asked._replace(kwargs=json.dumps(kwargs))
-    return runner.cached_environment(asked)
-
-
-def _check_unique_names(names: dict[str, str]) -> None:
-    """Raise ``ValueError`` if results of two methods would be stored under one name."""
-    first: dict[str, str] = {}
-    for file, name in names.items():
-        if first.setdefault(name, file) != file:
-            raise ValueError(f"{first[name]} and {file} have the same name, under which results "
-                             "are stored; rename one")
-
-
-def _absolute(method: str) -> str:
-    """Return the absolute path of a file or an installed method, or a built-in name unchanged."""
-    path = installed_methods().get(method, Path(method))
-    return str(path.absolute()) if is_path(str(path)) else method
+    return cached_environment(asked)

@@ -65,7 +65,10 @@ class Table(NamedTuple):
     @property
     def column_styles(self) -> list[str]:
         """Style of each column: ``drawn`` for intervals, ``words``, or empty for numbers."""
-        return [_kind([row.cells[i] for row in self.rows]) for i in range(len(self.headings))]
+        columns = [[row.cells[i] for row in self.rows] for i in range(len(self.headings))]
+        return ["drawn" if any(cell.picture for cell in column)
+                else "words" if any(isinstance(cell.value, str) for cell in column) else ""
+                for column in columns]
 
     def fit_width(self, width: int, order: Sequence[str] = ()) -> Table:
         """Return the table without the columns for which ``width`` characters are too few.
@@ -121,9 +124,3 @@ def mean_cell(values: Iterable[float]) -> Cell:
         return Cell(MISSING)
     mean, half = mean_and_interval(known)
     return Cell(format_mean(mean, half), mean)
-
-
-def _kind(column: list[Cell]) -> str:
-    if any(cell.picture for cell in column):
-        return "drawn"
-    return "words" if any(isinstance(cell.value, str) for cell in column) else ""

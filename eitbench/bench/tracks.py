@@ -27,11 +27,6 @@ CATEGORIES = ("filter", "fixed-lag", "smoothing", "stationary", "injection")
 """Groups of environments that are ranked together: subtracks, with stationary targets separate."""
 NAIVE_BASELINES = {"estimation": "homogeneous", "injection": "random_pair"}
 """Naive baselines: they define a leaderboard's episodes and the zero of its skill score."""
-ENV_KWARGS = {
-    "estimation": ("world", "lag", "assume", "episodes", "split", "render_mode"),
-    "injection": ("world", "estimator", "observation", "gate", "inflow", "episodes", "split",
-                  "render_mode")}
-"""Arguments of the environments of each track."""
 ONBOARD_FILTERS = ("full", "reduced")
 """Filters inside an injection environment: the exact one for scores, the reduced for training."""
 
@@ -44,8 +39,6 @@ MEASURED_SEEDS = "test:0-4"
 QUICK_IDS = ("eitbench/Pipe2D-v0", "eitbench/Pipe2DFixedLag-v0", "eitbench/Pipe2DSmoothing-v0")
 """Environments of the quick suite; the full suite has all of the track estimation."""
 QUICK_SEEDS = "test:0-3"
-
-
 RUN_KWARGS = {"estimation": {}, "injection": {"estimator": "full", "observation": "raw"}}
 """Default arguments of each track's environments in runs: the exact filter and unscaled
 observations. Registered ids have other defaults, for training."""
@@ -61,7 +54,9 @@ class Environment(NamedTuple):
     @property
     def overrides(self) -> dict[str, Any]:
         """Return the arguments that differ from the registered ones."""
-        return nondefault_kwargs(self.id, json.loads(self.kwargs))
+        usual = {"world": {}} | registered_kwargs(self.id)
+        return {key: value for key, value in json.loads(self.kwargs).items() if value is not None
+                and (key not in usual or json.dumps(value) != json.dumps(usual[key]))}
 
     @property
     def name(self) -> str:
@@ -77,9 +72,8 @@ class Environment(NamedTuple):
     def arguments(self) -> dict[str, Any]:
         """Return all arguments with which it is made, including defaults, but not the split of
         unseeded resets, which a run does not have."""
-        creator = load_env_creator(str(gym.spec(self.id).entry_point))
-        defaults = {name: each.default for name, each in signature(creator).parameters.items()
-                    if each.default is not Parameter.empty and name not in ("variant", "split")}
+        defaults = {name: each.default for name, each in _parameters(self.id).items()
+                    if each.default is not Parameter.empty and name != "split"}
         return (defaults | registered_kwargs(self.id) | RUN_KWARGS[self.track]
                 | json.loads(self.kwargs))
 
@@ -92,6 +86,13 @@ class Environment(NamedTuple):
                              f"{arguments['estimator']!r}")
         made: Any = gym.make(self.id, disable_env_checker=True, **arguments).unwrapped
         return made
+
+
+def _parameters(id: str) -> dict[str, Parameter]:
+    """Return the arguments that an id accepts in addition to its registered name and variant."""
+    creator = load_env_creator(str(gym.spec(id).entry_point))
+    return {name: each for name, each in signature(creator).parameters.items()
+            if name not in ("name", "variant")}
 
 
 def ids(track: str | None = None) -> list[str]:
@@ -139,13 +140,6 @@ def registered_kwargs(id: str) -> dict[str, Any]:
     return RUN_KWARGS[each.track] | dict(each.settings)
 
 
-def nondefault_kwargs(id: str, kwargs: dict[str, Any]) -> dict[str, Any]:
-    """Return the arguments that differ from the registered ones."""
-    usual = {"world": {}} | registered_kwargs(id)
-    return {key: value for key, value in kwargs.items() if value is not None
-            and (key not in usual or json.dumps(value) != json.dumps(usual[key]))}
-
-
 def environment_name(id: str, given: dict[str, Any]) -> str:
     """Return the name of an id with arguments that differ from the registered ones."""
     text = json.dumps(given, sort_keys=True)
@@ -181,18 +175,17 @@ def subtracks_of(id: str, kwargs: dict[str, Any]) -> tuple[str, ...]:
     if the subtrack depends on a changed world, else one. ``ValueError`` if an argument is invalid.
     """
     track = track_of(id)
+    known = _parameters(id) if kwargs else ()
     for name, value in kwargs.items():
-        if name not in ENV_KWARGS[track]:
+        if name not in known:
             raise ValueError(f"{name} is not an argument of {id}; it must be one of "
-                             f"{', '.join(ENV_KWARGS[track])}")
+                             f"{', '.join(known)}")
         if name in ("world", "assume") and not isinstance(value, dict | None):
             raise ValueError(f"{name} must be an object, got {type(value).__name__}")
     if track == "injection":
         return SUBTRACKS[track]
     each = entry(id)
-    lag = kwargs.get("lag")
-    if lag is None:
-        lag = each.settings.get("lag", 0)
+    lag = each.settings.get("lag", 0) if kwargs.get("lag") is None else kwargs["lag"]
     if lag == "all":
         return ("smoothing",)
     if type(lag) is not int or lag < 0:
@@ -202,11 +195,6 @@ def subtracks_of(id: str, kwargs: dict[str, Any]) -> tuple[str, ...]:
     if kwargs.get("world"):                                 # its length is not computed here
         return ("fixed-lag", "smoothing")
     return ("smoothing",) if lag == each.world.n_steps - 1 else ("fixed-lag",)
-
-
-def track_of_subtrack(board: str) -> str:
-    """Return the track of a subtrack."""
-    return next(track for track, boards in SUBTRACKS.items() if board in boards)
 
 
 def category_of(id: str, board: str) -> str:

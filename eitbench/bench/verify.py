@@ -14,30 +14,16 @@ import pandas as pd
 from tqdm import tqdm
 
 from eitbench import _check
-from eitbench.bench.isolation import WorkerError, choose_isolation
-from eitbench.bench.methods import (
-    Method,
-    builtin_files,
-    builtin_sha256,
-    find_method,
-    installed_methods,
-    is_builtin,
-    is_path,
-    method_files,
-    method_sha256,
-)
-from eitbench.bench.records import (
-    COMMON_FIELDS,
-    read_record,
-    read_valid_files,
-    record_file_name,
-    split_outdated,
-    version_number,
-)
+from eitbench.bench import methods
+from eitbench.bench import records as stored
+from eitbench.bench.isolation import WorkerError
+from eitbench.bench.methods import is_builtin, method_files, method_sha256
+from eitbench.bench.records import read_valid_files, record_file_name, version_number
 from eitbench.bench.run import Job, run_jobs
 from eitbench.bench.runner import run_method
 from eitbench.bench.scores import compute_scores, scores
 from eitbench.bench.store import EpisodeStore
+from eitbench.bench.suites import isolated_job
 from eitbench.bench.table import Cell, Table
 from eitbench.bench.text import scores_by_seed
 from eitbench.bench.tracks import Environment
@@ -45,14 +31,12 @@ from eitbench.data.cache import use_cache_dir
 from eitbench.data.parallel import run_parallel
 from eitbench.data.seeds import parse_seeds
 
-BUILTIN_FIELDS = ("method", "board", "role", "privileged")
+BUILTIN_FIELDS = ("environment", "method", "board", "role", "privileged")
 """Fields that must be equal in a rerun of a built-in method; its title may have changed."""
 SCORE_TOLERANCE = 1e-6
 """Accepted relative difference of scores: the order of summation depends on the processor."""
 MANY_ROWS = 30
 """Above this number of episodes a table has a row for each environment instead."""
-
-
 EMPTY_ROW = {"record": "", "environment": "", "method": "", "episode": "", "isolation": "",
              "score": "", "difference": 0.0, "recorded": None, "rerun": None, "problem": "",
              "note": ""}
@@ -64,7 +48,8 @@ class EpisodeCheck(NamedTuple):
 
     record: dict[str, Any]
     episode: dict[str, Any]
-    job: Job | None
+    job: Any
+    """`Job`; None to replay"""
 
 
 def verify(paths: Sequence[Path], folder: Path, *, file: str | None = None, isolate: str = "auto",
@@ -89,7 +74,7 @@ def verify(paths: Sequence[Path], folder: Path, *, file: str | None = None, isol
     cases: list[EpisodeCheck] = []
     for path in paths:
         try:
-            record = read_record(path)
+            record = stored.read_record(path)
             job = None if replay else job_for_record(record, file, isolate,
                                                      submitted_methods_folder(path))
             if job is not None:
@@ -98,8 +83,7 @@ def verify(paths: Sequence[Path], folder: Path, *, file: str | None = None, isol
             rows.append({"record": path.name, "problem": str(error)})
             continue
         drawn = np.random.default_rng(seed).permutation(len(record["episodes"]))[:episodes]
-        for k in sorted(drawn):
-            episode = record["episodes"][k]
+        for episode in (record["episodes"][k] for k in sorted(drawn)):
             numbered = job and job._replace(seed=parse_seeds(episode["seed"])[0])
             cases.append(EpisodeCheck(record, episode, numbered))
     with use_cache_dir((folder / "cache").absolute()):
@@ -128,26 +112,25 @@ def select_records(folder: Path, environments: Sequence[str] = (), *, top: int =
         complaints += more
     if complaints:
         raise ValueError("; ".join(complaints))
-    current = {id(record) for record in split_outdated(list(read.values()))[0]}
-    asked = {path: record for path, record in read.items() if id(record) in current
-             and (not environments or record["environment"]["id"] in environments)}
-    chosen = _first(asked, top) if top else [
-        path for path, record in asked.items() if record["official"]]
+    asked = [record for record in stored.split_outdated(list(read.values()))[0]
+             if not environments or record["environment"]["id"] in environments]
+    chosen = _first(asked, top) if top else [record for record in asked if record["official"]]
     if not chosen:
         which = f" of {', '.join(environments)}" if environments else ""
         raise ValueError(f"records must be a folder with such records{which}, got {folder}")
-    return chosen
+    return [Path(folder) / record_file_name(record) for record in chosen]
 
 
-def _first(records: dict[Path, dict[str, Any]], count: int) -> list[Path]:
-    ranked: dict[str, list[tuple[float, Path]]] = {}
-    for path, record in records.items():
+def _first(records: list[dict[str, Any]], count: int) -> list[dict[str, Any]]:
+    """Return the ``count`` best ranked records of each environment."""
+    groups: dict[str, list[tuple[float, str, dict[str, Any]]]] = {}
+    for record in records:
         errors = list(scores_by_seed(record, "error").values())
         is_ranked = record["role"] is None and not record["privileged"]
         if is_ranked and len(errors) == len(record["episodes"]):
-            name = record["environment"]["name"]
-            ranked.setdefault(name, []).append((float(np.mean(errors)), path))
-    return [path for group in ranked.values() for _, path in sorted(group)[:count]]
+            groups.setdefault(record["environment"]["name"], []).append(
+                (float(np.mean(errors)), record_file_name(record), record))
+    return [record for group in groups.values() for *_, record in sorted(group)[:count]]
 
 
 # -- the method of a record ---------------------------------------------------------------------
@@ -159,7 +142,7 @@ def submitted_methods_folder(path: Path) -> Path:
 
 
 def job_for_record(record: dict[str, Any], file: str | None = None, isolate: str = "auto",
-           submitted: Path | None = None) -> Job:
+                   submitted: Path | None = None) -> Job:
     """Return the job, with seed 0, that a record describes. The method is in ``file``; by default
     the built-in or installed one of that name, or the file with the record's sha256 in the folder
     ``submitted``. ``ValueError`` if no file is found, or it does not match the record."""
@@ -170,8 +153,8 @@ def job_for_record(record: dict[str, Any], file: str | None = None, isolate: str
         raise ValueError(f"{record['method']} is not a built-in method, and its file is not in the "
                          "folder methods next to the records: pass it as --method, or replay a "
                          "policy's recorded actions with --replay")
-    path = find_method(method, environment.track)
-    built_in = builtin_files(environment.id).get(record["method"])
+    path = methods.find_method(method, environment.track)
+    built_in = methods.builtin_files(environment.id).get(record["method"])
     if is_builtin(method) and not (built_in and path.samefile(built_in)):
         raise ValueError(f"{path} must be the method of the record, {record['method']}, got "
                          "another built-in method")
@@ -179,23 +162,23 @@ def job_for_record(record: dict[str, Any], file: str | None = None, isolate: str
     if sha256 != record["method_sha256"] and not is_builtin(method):
         raise ValueError(f"the sha256 of {path.name} is {sha256}, but {record['method_sha256']} in "
                          "the record")
-    isolation = choose_isolation(environment, method, isolate, strict=True)
-    return Job(environment, method, 0, isolation)
+    return isolated_job(environment, method, isolate, strict=True)
 
 
 def _known(record: dict[str, Any]) -> str | None:
     """Return the built-in or installed method with the record's name."""
     name = record["method"]
-    path = (builtin_files(record["environment"]["id"]) | installed_methods()).get(name)
+    installed = methods.installed_methods()
+    path = (methods.builtin_files(record["environment"]["id"]) | installed).get(name)
     if path is None:
         return None
-    return name if path.suffix == ".py" and name not in installed_methods() else str(path)
+    return name if path.suffix == ".py" and name not in installed else str(path)
 
 
 def _submitted(record: dict[str, Any], folder: Path | None) -> str | None:
     """Return the file in a folder or its subfolders that has the record's sha256."""
     for path in sorted(folder.rglob("*")) if folder else []:
-        if not is_path(path.name) or not path.is_file() or path.is_symlink():
+        if not methods.is_path(path.name) or not path.is_file() or path.is_symlink():
             continue
         with suppress(ValueError):              # a file that another method lacks
             if method_sha256(method_files(path)) == record["method_sha256"]:
@@ -206,9 +189,9 @@ def _submitted(record: dict[str, Any], folder: Path | None) -> str | None:
 def is_builtin_record(record: dict[str, Any], method: str) -> bool:
     """Return whether ``method``, from a record's `job_for_record`, is built in. A copy of a
     built-in agent's checkpoint counts as built in."""
-    built_in = builtin_files(record["environment"]["id"]).get(record["method"])
+    built_in = methods.builtin_files(record["environment"]["id"]).get(record["method"])
     return is_builtin(method) or (built_in is not None and built_in.suffix == ".zip"
-                               and builtin_sha256(built_in) == record["method_sha256"])
+                               and methods.builtin_sha256(built_in) == record["method_sha256"])
 
 
 # -- one episode --------------------------------------------------------------------------------
@@ -218,28 +201,27 @@ def _rerun_rows(cases: list[EpisodeCheck], folder: Path, n_jobs: int, backend: s
                 ) -> list[dict[str, Any]]:
     """Run the episodes that are not stored in the folder, and compare. Versions of a method have
     separate stores, as third-party methods may share a name; so have kinds of isolation."""
-    found: dict[Path, list[tuple[EpisodeCheck, Job]]] = {}
+    found: dict[Path, list[EpisodeCheck]] = {}
     for case in cases:
-        if case.job is not None:
-            place = folder / case.job.isolation / case.record["version"]
-            found.setdefault(place, []).append((case, case.job))
+        place = folder / case.job.isolation / case.record["version"]
+        found.setdefault(place, []).append(case)
     rows = []
-    for place, pairs in found.items():
+    for place, own in found.items():
         store = EpisodeStore(place)
-        run_jobs([job for _, job in pairs], store, n_jobs=n_jobs, backend=backend,
+        run_jobs([case.job for case in own], store, n_jobs=n_jobs, backend=backend,
                  keep_estimates=False)
-        rows += [_rerun_row(case, job, store) for case, job in pairs]
+        rows += [_rerun_row(case, store) for case in own]
     return rows
 
 
-def _rerun_row(case: EpisodeCheck, job: Job, store: EpisodeStore) -> dict[str, Any]:
+def _rerun_row(case: EpisodeCheck, store: EpisodeStore) -> dict[str, Any]:
     """Compare a stored rerun with the record."""
-    record = case.record
+    record, _, job = case
     method = job.load()
     result = store.result(job.environment.name, method.name, job.seed)
-    fields = BUILTIN_FIELDS if is_builtin_record(record, job.method) else (*COMMON_FIELDS, "method")
+    fields = BUILTIN_FIELDS if is_builtin_record(record, job.method) else stored.COMMON_FIELDS
     problems = [f"{name} is {result[name]!r}, but {record[name]!r} in the record"
-                for name in (*fields, "environment") if result[name] != record[name]]
+                for name in fields if result[name] != record[name]]
     now, then = version_number(method.version), version_number(record["version"])
     note = ""
     if now and then and then < now:
@@ -280,7 +262,7 @@ def replay_actions(record: dict[str, Any], recorded: dict[str, Any]) -> dict[str
         raise ValueError(f"{recorded['seed']} has no recorded actions to replay")
     environment = Environment(record["environment"]["id"],
                               json.dumps(record["environment"]["kwargs"]))
-    replay = Method("injection", record["method"], record["title"], Path(), "",
+    replay = methods.Method("injection", record["method"], record["title"], Path(), "",
                     (record["board"],), {}, lambda *_: _Replay(actions))
     outcome = run_method(environment, replay, parse_seeds(recorded["seed"])[0]).outcome
     return {"status": "ok", "scores": compute_scores("injection", outcome),

@@ -17,6 +17,7 @@ import numpy as np
 import pandas as pd
 
 from eitbench._files import bundled_path
+from eitbench.bench import tracks
 from eitbench.bench.episode_table import read_episode_table, table_path
 from eitbench.bench.ranking import shared_ranks
 from eitbench.bench.records import (
@@ -34,15 +35,6 @@ from eitbench.bench.statistics import (
     stratified_bootstrap,
 )
 from eitbench.bench.text import scores_by_seed, seed_ranges
-from eitbench.bench.tracks import (
-    CATEGORIES,
-    NAIVE_BASELINES,
-    environment_name,
-    ids,
-    nominal_id,
-    track_of_subtrack,
-)
-from eitbench.bench.tracks import category_of as class_of_board
 from eitbench.bench.variants import flatten, format_setting
 from eitbench.scoring import normalised_score
 
@@ -126,10 +118,9 @@ class MethodRow(NamedTuple):
 
     def interval(self, name: str) -> tuple[float, float, float]:
         """Return a score and the ends of its interval; NaN and infinite where unknown."""
-        unknown = {name: math.nan, f"{name}_low": -math.inf, f"{name}_high": math.inf}
-        value, low, high = (default if self.cells[key] is None else self.cells[key]
-                            for key, default in unknown.items())
-        return value, low, high
+        value, low, high = (self.cells[f"{name}{end}"] for end in ("", "_low", "_high"))
+        return (math.nan if value is None else value, -math.inf if low is None else low,
+                math.inf if high is None else high)
 
 
 class Leaderboard(NamedTuple):
@@ -204,17 +195,12 @@ def leaderboard_table(found: Iterable[Leaderboard]) -> pd.DataFrame:
     return pd.DataFrame(rows, columns=csv_fields()).astype(types | {"rank": "Int64"})
 
 
-def boards(records: list[dict[str, Any]]) -> pd.DataFrame:
-    """Return the `leaderboards` of records as one table of `csv_fields`."""
-    return leaderboard_table(leaderboards(records))
-
-
 # -- environments ----------------------------------------------------------------------------------
 
 
 def record_category(record: dict[str, Any]) -> str:
     """Return the class in `CATEGORIES` of a record."""
-    return class_of_board(record["environment"]["id"], record["board"])
+    return tracks.category_of(record["environment"]["id"], record["board"])
 
 
 def base_environment(id: str) -> str:
@@ -235,9 +221,7 @@ def world_key(record: dict[str, Any]) -> str:
 def environment_title(record: dict[str, Any]) -> str:
     """Return the environment's id without its prefix, and its arguments."""
     environment = record["environment"]
-    is_default = environment["name"] == environment_name(environment["id"], {})
-    given = {} if is_default else environment["kwargs"]
-    return environment["id"].removeprefix("eitbench/") + _arguments(given)
+    return environment["id"].removeprefix("eitbench/") + _arguments(environment["kwargs"])
 
 
 def _arguments(kwargs: dict[str, Any]) -> str:
@@ -253,17 +237,13 @@ def _arguments(kwargs: dict[str, Any]) -> str:
 
 def leaderboards(records: list[dict[str, Any]]) -> list[Leaderboard]:
     """Return a board for each environment, class by class, each class followed by its aggregate.
+    ``ValueError`` if a record has other seeds than test.
 
     A leaderboard has the episodes of its naive baseline, or all if it has no baseline. Superseded
     records are left out. An aggregate, with ``environment`` `ALL`, holds the methods that have
     finished every episode of all `aggregate_environments` with a naive baseline (an official one
     where it exists), if there are several. ``seconds_per_step`` is in ms of the fastest
     episode, ``voltage_discrepancy`` in mV², ``peak_memory`` in 10⁶ bytes.
-
-    Raises
-    ------
-    ValueError
-        If a record has other seeds than test.
     """
     for record in records:
         if record["split"] != "test":
@@ -272,7 +252,7 @@ def leaderboards(records: list[dict[str, Any]]) -> list[Leaderboard]:
     current, _ = split_outdated(records)
     known = anchors(current)
     found: list[Leaderboard] = []
-    for name in CATEGORIES:
+    for name in tracks.CATEGORIES:
         members = [record for record in current if record_category(record) == name]
         made = _boards(members, current, known, ranked=True)
         found += [*made, *_aggregate(name, _aggregate_boards(made))]
@@ -281,17 +261,11 @@ def leaderboards(records: list[dict[str, Any]]) -> list[Leaderboard]:
 
 def run_leaderboards(records: list[dict[str, Any]], known: Anchors | None = None,
                      ) -> list[Leaderboard]:
-    """Return the boards of a user's own results, one for each environment and split, without ranks.
-
-    Parameters
-    ----------
-    records : list
-        Of any splits and versions; all of their episodes are shown.
-    known : Anchors
-        Errors that define normalised scores 0 and 1; default: from these records.
-    """
+    """Return the boards of a user's own results, one for each environment and split, without ranks,
+    from all episodes of records of any splits and versions. ``known`` are the errors that define
+    normalised scores 0 and 1; default: from these records."""
     known = anchors(records) if known is None else known
-    return _boards(sorted(records, key=_split_order), records, known, ranked=False)
+    return _boards(records, records, known, ranked=False)
 
 
 def _boards(records: Iterable[dict[str, Any]], timed: list[dict[str, Any]], known: Anchors, *,
@@ -299,18 +273,14 @@ def _boards(records: Iterable[dict[str, Any]], timed: list[dict[str, Any]], know
     """Return a board for each split and environment, in the order of registration; ``timed`` are
     the records whose machines are compared."""
     products = _matmul_seconds(timed)
-    kinds = [base_environment(id) for id in ids()]
+    kinds = [base_environment(id) for id in tracks.ids()]
     groups: dict[tuple[Any, ...], list[dict[str, Any]]] = {}
     for record in records:
         kind = base_environment(record["environment"]["id"])
         place = kinds.index(kind) if kind in kinds else len(kinds)
-        groups.setdefault((_split_order(record), place, world_key(record),
+        groups.setdefault((SPLIT_ORDER.index(record["split"]), place, world_key(record),
                            record["environment"]["name"]), []).append(record)
     return [_board(groups[key], known, products, ranked=ranked) for key in sorted(groups)]
-
-
-def _split_order(record: dict[str, Any]) -> int:
-    return SPLIT_ORDER.index(record["split"])
 
 
 def _board(records: list[dict[str, Any]], known: Anchors, products: dict[str, float], *,
@@ -323,9 +293,8 @@ def _board(records: list[dict[str, Any]], known: Anchors, products: dict[str, fl
     zero = episode_errors(floor)
     rows = sorted((_row(record, seeds, zero, known, products) for record in records
                    if not seeds.isdisjoint(record["seeds"])), key=_sort_key)
-    competing = {row.label: {environment: episode_errors(row.record)} for row in rows
-                 if not row.cells["note"]}
-    ranks = shared_ranks(competing) if competing and ranked else {}
+    ranks = shared_ranks({row.label: {environment: episode_errors(row.record)} for row in rows
+                          if ranked and not row.cells["note"]})
     return Leaderboard(record_category(records[0]), environment, environment_title(records[0]),
                        _with_ranks(rows, ranks))
 
@@ -376,7 +345,8 @@ def naive_baseline_record(records: Iterable[dict[str, Any]]) -> dict[str, Any] |
 
 def is_naive_baseline(record: dict[str, Any]) -> bool:
     """Return True for a record of the built-in naive baseline (its version is a number)."""
-    return (record["method"] == NAIVE_BASELINES[track_of_subtrack(record["board"])]
+    track = "injection" if record["board"] == "injection" else "estimation"
+    return (record["method"] == tracks.NAIVE_BASELINES[track]
             and version_number(record["version"]) is not None)
 
 
@@ -414,7 +384,7 @@ def _with_interval(name: str, values: dict[str, dict[str, float]],
 def aggregate_environments() -> set[str]:
     """Return the names of the environments of aggregates: all registered ids with their default
     arguments, without shifted environments, which have a separate leaderboard."""
-    return {environment_name(id, {}) for id in ids() if not nominal_id(id)}
+    return {tracks.environment_name(id, {}) for id in tracks.ids() if not tracks.nominal_id(id)}
 
 
 def _aggregate_boards(made: list[Leaderboard]) -> list[Leaderboard]:
@@ -447,8 +417,7 @@ def _aggregate(category: str, made: list[Leaderboard]) -> list[Leaderboard]:
             | {"official": all(row.cells["official"] for row in own)}))
         if not note:
             competing[label] = gains
-    ranks = shared_ranks(competing, statistic=interquartile_mean,
-                         higher_is_better=True) if competing else {}
+    ranks = shared_ranks(competing, statistic=interquartile_mean, higher_is_better=True)
     rows.sort(key=lambda row: (-row.cells["gain"], row.cells["method"], row.cells["version"]))
     board = Leaderboard(category, ALL, "All environments", _with_ranks(rows, ranks))
     return [board] if rows else []
@@ -459,12 +428,7 @@ def _aggregate(category: str, made: list[Leaderboard]) -> list[Leaderboard]:
 
 def read_leaderboard_records(folder: Path) -> tuple[list[dict[str, Any]], list[str]]:
     """Return the records of a folder that boards show, and one message for each invalid record.
-
-    Raises
-    ------
-    ValueError
-        If the folder does not exist or holds no valid record of test seeds.
-    """
+    ``ValueError`` if the folder does not exist or holds no valid record of test seeds."""
     if not folder.is_dir():
         raise ValueError(f"records must be a folder that exists, got {folder}")
     read, complaints = read_valid_files(folder)
@@ -497,10 +461,9 @@ def anchors(records: Iterable[dict[str, Any]]) -> Anchors:
 def bundled_anchors(records: Iterable[dict[str, Any]]) -> Anchors:
     """Return the `anchors` of the worlds of these records among the records of the package."""
     kinds = {base_environment(record["environment"]["id"]) for record in records}
-    known = [id.replace("/", "-") for id in ids("estimation") if base_environment(id) in kinds]
     published = read_episode_table(table_path(bundled_path("leaderboards") / "results"))
-    return anchors(record for record in published if record["method"] in SKILL_ANCHORS
-                   and record["environment"]["name"] in known)
+    return anchors(record for record in published if not record["environment"]["kwargs"]
+                   and base_environment(record["environment"]["id"]) in kinds)
 
 
 def _normalised_score(record: dict[str, Any], known: Anchors) -> float | None:

@@ -53,11 +53,10 @@ def failures(store: EpisodeStore, records: Iterable[dict[str, Any]]) -> list[Fai
     """Return the failures of records of a store, in their order."""
     found = []
     for record in records:
-        tracebacks = store.tracebacks(record)
         seeds: dict[tuple[str, str], list[str]] = {}
         for episode in record["episodes"]:
             if episode["status"] != "ok":
-                error = episode["message"], tracebacks[episode["seed"]]
+                error = episode["message"], store.traceback(record, episode["seed"])
                 seeds.setdefault(error, []).append(episode["seed"])
         found += [Failure(record, those, *error) for error, those in seeds.items()]
     return found

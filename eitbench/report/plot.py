@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Iterator
-from typing import Any, Literal
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -166,21 +166,15 @@ def compare(table: pd.DataFrame | Iterable[pd.DataFrame], ax: Axes | None = None
         ax.errorbar(mean, place, xerr=half if np.isfinite(half) else None, fmt="o", color="#1b4965",
                     capsize=4, markersize=6)
     if min(own.min() for own in values.values()) > 0:
-        logarithmic(ax, "x")
+        ax.set_xscale("log")
+        ax.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+        ax.xaxis.set_major_formatter(lambda value, place: f"{value:g}")
+        ax.xaxis.set_minor_formatter(NullFormatter())
     ax.set_yticks(range(len(order)), order)
     ax.set_ylim(-0.6, len(order) - 0.4)
     ax.set_xlabel(asked.heading)
     ax.grid(axis="x", alpha=0.3)
     return ax
-
-
-def logarithmic(ax: Axes, which: Literal["x", "y"]) -> None:
-    """A logarithmic axis whose ticks are plain numbers: 1, 2, 5 times powers of ten."""
-    ax.set(**{f"{which}scale": "log"})  # type: ignore[arg-type]
-    axis = ax.xaxis if which == "x" else ax.yaxis
-    axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
-    axis.set_major_formatter(lambda value, place: f"{value:g}")
-    axis.set_minor_formatter(NullFormatter())
 
 
 def parse_single_seed(seed: int | str) -> int:

@@ -41,18 +41,8 @@ def adaptivity_gap(rows: pd.DataFrame, open_loop: Sequence[str] = OPEN_LOOP,
     """Return (best open-loop − clairvoyant) / (random − clairvoyant) of mean errors, with the ends
     of its 95 % bootstrap interval over the episodes, infinite where there are too few.
 
-    Parameters
-    ----------
-    rows : DataFrame
-        Columns policy, seed and error, with the policies clairvoyant, random_pair and some of
-        ``open_loop``, all on the same episodes.
-    open_loop : sequence of str
-        Names; the one with the least mean error counts.
-
-    Raises
-    ------
-    ValueError
-        If one of these policies is missing in some episode.
+    ``rows`` have the columns policy, seed and error. ``ValueError`` unless they hold clairvoyant,
+    random_pair and some of ``open_loop``, of which the best counts, all on the same episodes.
     """
     errors = errors_by_policy(rows)
     blind = [name for name in open_loop if name in errors]

@@ -80,7 +80,7 @@ def worker(path, kind="bubblewrap", **how):
 def ask(path, kind="bubblewrap", *, reply_timeout=60.0, **how):
     """Run the file for some steps; return the exception."""
     with worker(path, kind, **how) as there:
-        there.begin()
+        there(None)
         there.reply_timeout = reply_timeout
         with pytest.raises(WorkerError) as caught:
             there.update(np.zeros(4), np.zeros(4))
@@ -335,8 +335,8 @@ def test_a_worker_ends_with_its_parent(kind, tmp_path):
     path = write_baseline(tmp_path, update=STUBBORN if kind == "bubblewrap" else "while True: pass")
     program = ("import numpy as np; from eitbench.bench.isolation import Worker\n"
                f"there = Worker('estimation', {FILTER.id!r}, {json.loads(FILTER.kwargs)!r}, {path!r}, {kind!r})\n"
-               "there.begin(); there._send(__import__('eitbench.bench.isolation').bench.isolation.encode_message("
-               "{'do': 'update'}, {'voltages': np.zeros(4), 'currents': np.zeros(4)}))\n"
+               "there(None); there._send(__import__('eitbench.bench.isolation').bench.isolation.encode_message("
+               "{'do': 'update', 'voltages': np.zeros(4), 'currents': np.zeros(4)}))\n"
                "import time; time.sleep(1.0); print(*there._family(), flush=True); time.sleep(60)")
     with subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE, text=True) as host:
         family = [int(pid) for pid in host.stdout.readline().split()]
@@ -360,7 +360,7 @@ def test_an_unread_request_times_out(tmp_path):
     ahead = ("from eitbench.bench.isolation import encode_message\n        os.write(4, encode_message({}))\n"
              "        while True: os.write(4, encode_message({'estimate': None}))")
     with worker(write_baseline(tmp_path, init=ahead), "process") as there:
-        there.begin()
+        there(None)
         there.reply_timeout = 2.0
         with pytest.raises(WorkerError, match="TimeoutError: no reply within 2 s"):
             for _ in range(100):
@@ -394,13 +394,13 @@ def test_the_next_episode_begins_with_a_worker_that_answers(statement, tmp_path)
 
 
 def test_a_changed_file_does_not_run(tmp_path):
-    """A record is of one file; a new worker must not run another."""
+    """A record is of one file; a new process runs the content that was loaded."""
     path = write_baseline(tmp_path)
     loaded = Job(FILTER, path, 1, "process").load()
     isolation.close()
     write_baseline(tmp_path, update="raise RuntimeError('changed')")
-    with pytest.raises(WorkerError, match="was changed during the run"):
-        loaded.make(None)
+    assert loaded.make(None).update(np.zeros(4), np.zeros(4)).mean.size
+    assert Job(FILTER, path, 1, "process").load().sha256 != loaded.sha256
 
 
 ABOUT = """import os
@@ -444,7 +444,7 @@ def test_output_is_prefixed_sanitised_and_limited(tmp_path, capsys):
     """Standard error shows the method's lines without control characters."""
     path = write_baseline(tmp_path, init="print('made\\x1b[2J'); print('x' * 20_000)")
     with worker(path, "process") as there:
-        there.begin()
+        there(None)
     printed = capsys.readouterr().err
     assert "[mine] made\\x1b[2J\n[mine] xxx" in printed and len(printed) < 11_000
 
@@ -452,8 +452,9 @@ def test_output_is_prefixed_sanitised_and_limited(tmp_path, capsys):
 def test_an_episode_has_a_time_limit(tmp_path, monkeypatch):
     """The limit holds for the sum of the replies, each within its own limit."""
     with worker(write_baseline(tmp_path, update="__import__('time').sleep(0.2)"), "process") as there:
+        there.start()
         monkeypatch.setattr(isolation, "EPISODE_TIMEOUT_S", 0.5)
-        there.begin()
+        there(None)
         with pytest.raises(WorkerError, match="its replies in one episode took more"):
             for _ in range(10):
                 there.update(np.zeros(4), np.zeros(4))
@@ -465,14 +466,18 @@ numbers = hnp.arrays(st.sampled_from([np.float64, np.float32, np.int64, np.bool_
                      hnp.array_shapes(min_dims=0, min_side=0))
 
 
-@given(st.dictionaries(st.text(), st.integers() | st.text() | st.none()), st.dictionaries(st.text(), numbers))
-def test_messages_arrive(header, arrays):
-    """Headers and arrays of all shapes are decoded unchanged."""
-    said, there = decode_message(io.BytesIO(encode_message(header, arrays)).read)
-    assert said == header and set(there) == set(arrays)
-    for name, array in arrays.items():
-        assert there[name].dtype == array.dtype and there[name].shape == array.shape
-        np.testing.assert_array_equal(there[name], array)
+@given(st.dictionaries(st.text(), st.integers() | st.text() | st.none() | numbers))
+def test_messages_arrive(content):
+    """Values and arrays of all shapes are decoded unchanged."""
+    values, arrays = decode_message(io.BytesIO(encode_message(content)).read)
+    assert set(values | arrays) == set(content)
+    for name, value in (values | arrays).items():
+        assert isinstance(content[name], np.ndarray) == (name in arrays)
+        if name in values:
+            assert value == content[name]
+        else:
+            assert value.dtype == content[name].dtype and value.shape == content[name].shape
+            np.testing.assert_array_equal(value, content[name])
 
 
 @pytest.mark.parametrize(("head", "body"), [
@@ -493,14 +498,14 @@ def test_malformed_messages_are_rejected(head, body):
 
 
 def test_a_run_leaves_no_worker(tmp_path, monkeypatch):
-    """One worker runs all episodes of a method, and ends with the run."""
+    """One process runs all episodes of a method after one that loads it, and ends with the run."""
     made = []
 
     class Counted(Worker):
-        def __init__(self, *arguments, **rest):
-            assert not any(each.is_alive for each in made)
-            super().__init__(*arguments, **rest)
+        def start(self):
+            super().start()
             made.append(self)
+            assert sum(each.is_alive for each in {*made}) == 1
 
     monkeypatch.setattr(isolation, "Worker", Counted)
     jobs = [Job(FILTER, write_baseline(tmp_path, name), seed, "process")

@@ -10,9 +10,8 @@ import numpy as np
 import pytest
 from eitbench.bench import runner
 from eitbench.bench.methods import Method
-from eitbench.bench.outcomes import EstimatorOutput
 from eitbench.bench.run import Job, run_episode, run_jobs
-from eitbench.bench.runner import run_estimator
+from eitbench.bench.runner import EstimatorOutput, run_estimator
 from eitbench.bench.store import EpisodeStore
 from eitbench.bench.tracks import Environment, subtrack_of
 from eitbench.data.cache import CACHE_VARIABLE
@@ -192,7 +191,7 @@ def test_estimates_are_of_the_lagged_state(environment, board):
     def update(task, i, *_):
         return Estimate(np.full(1701, 20.0 + i - task.lag)) if i > task.lag else None
 
-    played = EstimatorOutput.collect(env.task, runner._iter_steps(env, baseline_of(update), 3))
+    played = EstimatorOutput(env.task, runner._iter_steps(env, baseline_of(update), 3))
     np.testing.assert_array_equal(played.means, np.repeat(20.0 + np.arange(1, 6)[:, None], 1701, axis=1))
     assert played.voltages.shape == played.currents.shape == (5, 4) and len(played.seconds) == 5 + env.task.lag
 

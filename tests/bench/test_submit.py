@@ -6,7 +6,7 @@ import pytest
 from eitbench.bench import load, methods, run, suites
 from eitbench.bench import store as store_module
 from eitbench.bench.records import read_record, read_records, split_outdated, write_record
-from eitbench.bench.store import EpisodeStore, provenance
+from eitbench.bench.store import EpisodeStore, machine, provenance
 from eitbench.bench.submit import submit
 from eitbench.data.seeds import parse_seeds
 
@@ -36,7 +36,7 @@ def test_a_submission_is_a_record_per_environment(tmp_path):
     assert (first["board"], second["board"]) == ("filter", "smoothing") and count(log) == 4
     assert first["seeds"] == ["test:0", "test:1"] and not first["official"] and first["split"] == "test"
     assert first["runs"][0]["command"] == "eitbench submit"
-    assert first["runs"][0]["machine"]["matmul_seconds"] == store_module.matmul_seconds() > 0
+    assert first["runs"][0]["machine"]["matmul_seconds"] == machine()["matmul_seconds"] > 0
     assert sorted(path.name for path in to.iterdir()) == sorted(path.name for path in paths)
     again = list(submit(mine, [FILTER.id], TEST, store, to, official=True, isolate="process"))
     assert again == paths[:1] and count(log) == 4 and read_record(again[0])["official"]

@@ -20,7 +20,7 @@ from typer.main import get_command
 
 from commands import eitbench
 from short import PLAIN, shorten, world
-from tiny import git_says
+from tiny import git_says, write_baseline
 
 ROOT = Path(__file__).parents[2]
 PIPE, INJECTION = "eitbench/Pipe2D-v0", "eitbench/Pipe2DInjection-v0"
@@ -114,6 +114,18 @@ def test_suites():
     assert min(parse_seeds(entry(PIPE).test_seeds)) == 200_000
     asked_for = suites.make_jobs("estimation", [PIPE], ["gauss_newton"], [1, 2], suite="quick")
     assert [job.seed for job in asked_for] == [1, 2]
+
+
+def test_agents_of_two_environments_may_have_one_name(tmp_path, monkeypatch):
+    """Results are stored by environment; only two files of one environment must have different names."""
+    monkeypatch.setattr(suites, "builtin_methods", lambda track: [])
+    monkeypatch.setattr(suites, "builtin_agents", lambda id: [write_baseline(tmp_path / id)])
+    pair = ids("estimation")[:2]
+    jobs = suites.make_jobs("estimation", pair, [], [1], isolate="none")
+    assert [job.environment.id for job in jobs] == pair
+    files = [write_baseline(tmp_path / id) for id in pair]
+    with pytest.raises(ValueError, match="have the same name"):
+        suites.make_jobs("estimation", pair[:1], files, [1], isolate="none")
 
 
 # -- help -------------------------------------------------------------------------------------------------------------

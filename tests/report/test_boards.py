@@ -13,10 +13,11 @@ from eitbench.bench import load
 from eitbench.bench.records import read_records, write_record
 from eitbench.bench.statistics import interquartile_mean, stratified_bootstrap
 from eitbench.bench.tracks import environment_name
-from eitbench.report.boards import ALL, boards, record_category
+from eitbench.report.boards import ALL, record_category
 from eitbench.report.site import collect, render
 from eitbench.report.tables import BADGES
 
+from tables import boards
 from tiny import BOARD_IDS, RUN, record, sha
 
 ROOT = Path(__file__).parents[2]

@@ -13,7 +13,6 @@ from eitbench.bench.statistics import (
 )
 from eitbench.bench.text import scores_by_seed
 from eitbench.report import compare as comparison
-from eitbench.report.boards import boards
 from eitbench.report.compare import (
     compare,
     comparison_table,
@@ -23,7 +22,7 @@ from eitbench.report.compare import (
     naive_baseline_records,
 )
 
-from tables import said
+from tables import boards, said
 from tiny import record, sha
 
 TANK = "eitbench/RotatingTank2D-v0"

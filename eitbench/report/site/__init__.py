@@ -62,7 +62,6 @@ LINKS = {"Submit a method": "README.md", "Statistics": "../docs/statistics.md",
 """Link of every page -> file, from the leaderboards' folder."""
 METHODS_FOLDER = "../baselines"
 """Folder of the built-in methods, from the leaderboards' folder."""
-PUBLIC_EPISODES = "The test episodes are public: every user can simulate them."
 SITE_MARKER = b"<strong>eitbench</strong> leaderboards"
 """Text by which the index.html of a site is recognised."""
 
@@ -143,7 +142,8 @@ def render(site: Site) -> dict[str, str]:
     in the second only."""
     parts = ["# Leaderboards", "*Rendered from the records by `eitbench leaderboard --records "
              "leaderboards/results`; [README.md](README.md) explains how to add one.*",
-             PUBLIC_EPISODES if site.boards else "No records yet."]
+             "The test episodes are public: every user can simulate them." if site.boards
+             else "No records yet."]
     for name, boards in site.classes.items():
         parts.append(f"## {name}")
         for board in boards:
@@ -160,9 +160,9 @@ def render(site: Site) -> dict[str, str]:
     table = leaderboard_table(site.boards).replace({"environment": {
         record["environment"]["name"]: qualified_name(record["environment"])
         for record in site.records}})
-    for name, factor in {**{name: score.factor for name, score in scores().items()},
-                         "peak_memory": 1e-6}.items():
-        table[name] /= factor
+    for name, score in scores().items():
+        table[name] /= score.factor
+    table["peak_memory"] /= 1e-6
     texts = {name: table[name].map(escape_csv) for name in ("environment", "method", "title")}
     plain = table.assign(**texts).to_csv(index=False, float_format="%.6g", lineterminator="\n")
     return {"leaderboard.csv": plain, "leaderboard.md": "\n\n".join(parts) + "\n"}
@@ -170,13 +170,8 @@ def render(site: Site) -> dict[str, str]:
 
 def write_site(folder: Path, files: Mapping[str, bytes]) -> None:
     """Make the folder hold these files and no others, all at once: an interruption leaves the
-    previous site.
-
-    Raises
-    ------
-    ValueError
-        If the folder is neither empty nor such a site: then it is not touched.
-    """
+    previous site. ``ValueError`` if the folder is neither empty nor such a site, which leaves it
+    unchanged."""
     index = folder / "index.html"
     is_site = index.is_file() and SITE_MARKER in index.read_bytes()
     if folder.exists() and any(folder.iterdir()) and not is_site:
