@@ -1,4 +1,4 @@
-"""Injection environments with few steps for the agent, and helpers for their tests."""
+"""Injection environments on short worlds, and helpers for their tests."""
 
 import json
 
@@ -8,28 +8,24 @@ from eitbench.bench import runner
 from eitbench.bench.methods import load_method
 from eitbench.bench.scores import Outcome
 from eitbench.bench.tracks import Environment
+from eitbench.worlds import entries
 
-from short import merged
+import short
 
 NAME, INFLOW = "eitbench/Pipe2DInjection-v0", "eitbench/Pipe2DInjectionInflow-v0"
 CURRENTS, FAULTS, BUDGET = (f"eitbench/Pipe2DInjection{kind}-v0" for kind in ("Currents", "Faults", "Budget"))
 TANK, FLOW = "eitbench/RotatingTankInjection-v0", "eitbench/Pipe2DInjectionFlow-v0"
-# Sixteen electrodes and a short episode; fewer electrodes have too little information.
-SHORT = {"flow": {"mean_velocity": 16.0}, "schedule": {"scored_steps": 4}}
+FEW_STEPS = short.merged(short.DRAWN, {"vessel": {"electrodes_per_wall": 8}})
+"""Five steps, the agent's are the last three: the full filter of an unknown flow takes a second for each."""
+INJECTION = [id for id, each in entries().items() if each.track == "injection"]
 
 
 def make(estimator: str = "none", name: str = NAME, observation: str = "raw", longer: dict | None = None,
          **kwargs) -> gym.Env:
-    """Make an environment with a short world; ``longer`` overrides more parameters."""
-    return gym.make(name, estimator=estimator, world=merged(world(name), longer or {}), observation=observation,
-                    **kwargs)
-
-
-def world(name: str) -> dict:
-    """Return overrides of the world with few steps for the agent."""
-    if name == FLOW:
-        return merged(SHORT, {"flow": {"velocity_range": [15.0, 17.0]}})
-    return {"schedule": {"warm_up": 2, "scored_steps": 3}} if name == TANK else SHORT
+    """Make the environment of an id on its short world; ``longer`` overrides more parameters."""
+    world = FEW_STEPS if name == FLOW and estimator == "full" else short.world(name)["world"]
+    world = short.merged(world, longer or {})
+    return gym.make(name, estimator=estimator, world=world, observation=observation, **kwargs)
 
 
 def filter_of(whose):
@@ -38,7 +34,7 @@ def filter_of(whose):
 
 
 def play(env: gym.Env, seed: int, actions: np.ndarray) -> list[tuple]:
-    """Return (observation, reward, terminated, truncated, info) of each step of an episode under these actions."""
+    """Return (observation, reward, terminated, truncated, info) of each step of an episode of either track."""
     observation, info = env.reset(seed=seed)
     steps = [(observation, 0.0, False, False, info)]
     while not steps[-1][2]:

@@ -8,13 +8,11 @@ from eitbench.bench import store
 from eitbench.bench.records import SCHEMA, split_of, with_content_hash
 from eitbench.bench.tracks import Environment
 
-SCENARIO = {"flow": {"mean_velocity": 45.0}, "schedule": {"scored_steps": 3, "pattern": {"frame": 2}},
-            "vessel": {"electrodes_per_wall": 2}}
-"""A fast fluid flushes the pipe in two steps: five measurements, the last three states are scored."""
+from short import FAST
 
-FILTER = Environment("eitbench/Pipe2D-v0", json.dumps({"world": SCENARIO}))
-FIXED_LAG = Environment("eitbench/Pipe2DFixedLag-v0", json.dumps({"world": SCENARIO, "lag": 2}))
-SMOOTHING = Environment("eitbench/Pipe2DSmoothing-v0", json.dumps({"world": SCENARIO}))
+FILTER = Environment("eitbench/Pipe2D-v0", json.dumps({"world": FAST}))
+FIXED_LAG = Environment("eitbench/Pipe2DFixedLag-v0", json.dumps({"world": FAST, "lag": 2}))
+SMOOTHING = Environment("eitbench/Pipe2DSmoothing-v0", json.dumps({"world": FAST}))
 
 RUN = {"command": "eitbench run", "blas": "scipy-openblas", "commit": "c0ffee", "dirty": False,
        "source": hashlib.sha256(b"code").hexdigest(),

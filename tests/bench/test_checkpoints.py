@@ -37,13 +37,16 @@ def test_checkpoints_do_not_contain_the_optimiser():
 
 @pytest.mark.parametrize("path", AGENTS, ids=lambda path: "-".join(path.split("/")[-4:-1]))
 def test_agents_reproduce_their_evaluation(path):
-    """The error in the first dev episode equals the last evaluation; rounding may change a close decision."""
+    """The error in the first dev episode equals the last evaluation; rounding may change a close decision. Only
+    the second training of each environment runs here; the golden files hold the first."""
     folder, agent = FOLDER.joinpath(*path.split("/")[-4:-1]), load_method(path, "injection")
     asked = json.loads((folder / "config.json").read_text())
     assert agent.name == f"{asked['algo']}_{folder.name}" and folder.parts[-2] == asked["algo"]
     assert folder.parts[-3] == asked["env"].replace("/", "-") and asked["kwargs"] == {}
     kept = np.load(folder / "evaluations.npz")
     assert kept["timesteps"][0] == 0 and kept["timesteps"][-1] >= asked["config"]["total_steps"]
+    if folder.name != "seed1":
+        return
     error = injected(asked["env"], {}, path, FIRST, "reduced").errors.mean()
     np.testing.assert_allclose(error, kept["errors"][-1][0], rtol=0.02)
 

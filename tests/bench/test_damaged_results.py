@@ -10,7 +10,7 @@ from eitbench.bench.store import EpisodeStore
 
 from commands import eitbench
 from short import shorten
-from tiny import FILTER, SCENARIO, write_baseline
+from tiny import FILTER, write_baseline
 
 
 @pytest.fixture(scope="module")
@@ -18,7 +18,7 @@ def two_methods(tmp_path_factory):
     """A folder with two episodes of each of two methods."""
     folder = tmp_path_factory.mktemp("two")
     with pytest.MonkeyPatch.context() as patch:
-        shorten(patch, {FILTER.id: SCENARIO})
+        shorten(patch, FILTER.id)
         patch.chdir(folder)
         write_baseline(folder)
         code, _, complaint = eitbench("run", "--baseline", "mine.py", "--baseline", "homogeneous", "--env", FILTER.id,
@@ -30,7 +30,7 @@ def two_methods(tmp_path_factory):
 @pytest.fixture
 def played(two_methods, monkeypatch, tmp_path):
     """The results of one method in a copy of that folder, with the same shortened environment."""
-    shorten(monkeypatch, {FILTER.id: SCENARIO})
+    shorten(monkeypatch, FILTER.id)
     monkeypatch.chdir(tmp_path)
     shutil.copytree(two_methods, tmp_path / "results")
     return tmp_path / "results" / "episodes" / "eitbench-Pipe2D-v0" / "mine"
@@ -98,7 +98,7 @@ def test_results_that_are_not_files_are_reported(played):
 
 def test_control_characters_of_an_exception_are_escaped(tmp_path, monkeypatch):
     """Control characters in a method's title and message are escaped in the terminal, the table and the page."""
-    shorten(monkeypatch, {FILTER.id: SCENARIO})
+    shorten(monkeypatch, FILTER.id)
     monkeypatch.chdir(tmp_path)
     write_baseline(tmp_path, "loud", doc="Loud *",
                    update="raise ValueError('\\x1b[2J\\u202eall well\\nfailed: nothing')")

@@ -10,15 +10,15 @@ import pytest
 from eitbench import Estimate
 from eitbench.bench.run import Job, run_episode
 
-from short import PIPE, shorten
-from tiny import FILTER, SCENARIO, write_baseline
+from short import FAST, shorten
+from tiny import FILTER, write_baseline
 
 INJECTION = "eitbench/Pipe2DInjection-v0"
 
 
 @pytest.fixture(autouse=True)
 def tiny_world(monkeypatch):
-    shorten(monkeypatch, {INJECTION: PIPE})
+    shorten(monkeypatch, INJECTION)
 
 
 class Level:
@@ -37,15 +37,15 @@ def without_time(table):
 
 def test_scores_agree_with_the_commands(tmp_path):
     """The scores agree for a class, for its file, for an environment that was made before, and in two processes."""
-    table = eitbench.evaluate(Level, FILTER.id, "dev:0-2", world=SCENARIO)
+    table = eitbench.evaluate(Level, FILTER.id, "dev:0-2", world=FAST)
     assert table["seed"].tolist() == ["dev:0", "dev:1", "dev:2"] and set(table["method"]) == {"Level"}
     path = write_baseline(tmp_path, update="return Estimate(self.level + voltages.sum())")
     for seed, error, bias in zip((100_000, 100_001, 100_002), table["error"], table["contrast_error"], strict=True):
         said = run_episode(Job(FILTER, path, seed))[0]["scores"]
         assert (said["error"], said["contrast_error"]) == (error, bias) and error > 0
-    file = eitbench.evaluate(path, FILTER.id, [100_000, 100_001, 100_002], world=SCENARIO)
-    made = eitbench.evaluate(Level, gym.make(FILTER.id, world=SCENARIO), "dev:0-2")
-    both = eitbench.evaluate(Level, FILTER.id, "dev:0-2", world=SCENARIO, n_jobs=2)
+    file = eitbench.evaluate(path, FILTER.id, [100_000, 100_001, 100_002], world=FAST)
+    made = eitbench.evaluate(Level, gym.make(FILTER.id, world=FAST), "dev:0-2")
+    both = eitbench.evaluate(Level, FILTER.id, "dev:0-2", world=FAST, n_jobs=2)
     for other in (file, made, both):
         assert without_time(other).equals(without_time(table))
     assert set(table["environment"]) == {f"{FILTER.id}{FILTER.name.removeprefix('eitbench-Pipe2D-v0')}"}
@@ -83,7 +83,7 @@ def test_exceptions_of_the_method_propagate():
             raise ZeroDivisionError("dry")
 
     with pytest.raises(ZeroDivisionError, match="dry") as caught:
-        eitbench.evaluate(Fails, FILTER.id, "dev:0", world=SCENARIO)
+        eitbench.evaluate(Fails, FILTER.id, "dev:0", world=FAST)
     assert caught.value.__notes__ == ["Fails on eitbench/Pipe2D-v0, dev:0"]
 
 
@@ -93,14 +93,14 @@ def test_a_file_is_isolated_on_request(tmp_path):
     init = f"print(os.getpid(), file=open({str(log)!r}, 'w'))"
     path = write_baseline(tmp_path, update="return Estimate(self.level + voltages.sum())")
     spy = write_baseline(tmp_path, "spy", init=init, update="return Estimate(self.level + voltages.sum())")
-    here, apart = (eitbench.evaluate(path, FILTER.id, "dev:0-1", world=SCENARIO, isolate=isolate)
+    here, apart = (eitbench.evaluate(path, FILTER.id, "dev:0-1", world=FAST, isolate=isolate)
                    for isolate in (None, "process"))
     assert without_time(apart).equals(without_time(here))
-    eitbench.evaluate(spy, FILTER.id, "dev:0", world=SCENARIO)
+    eitbench.evaluate(spy, FILTER.id, "dev:0", world=FAST)
     assert int(log.read_text()) == os.getpid()
     log.unlink()
     with contextlib.suppress(RuntimeError):                       # writing may be forbidden
-        eitbench.evaluate(spy, FILTER.id, "dev:0", world=SCENARIO, isolate="process")
+        eitbench.evaluate(spy, FILTER.id, "dev:0", world=FAST, isolate="process")
     assert not log.exists() or int(log.read_text()) != os.getpid()
     with pytest.raises(ValueError, match="method must be a name or a path to be isolated, got type"):
         eitbench.evaluate(Level, FILTER.id, "dev:0", isolate="process")

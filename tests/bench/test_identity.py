@@ -14,9 +14,9 @@ from eitbench.bench.tracks import Environment
 from eitbench.data.cache import CACHE_VARIABLE
 from eitbench.worlds import entry, register, registry
 
-from short import register_apart
+from short import FAST, register_apart
 from tiny import FILTER, FIXED_LAG, count, counting, write_baseline
-from tiny_worlds import CHANGES, TINY
+from tiny_worlds import TINY
 
 ID = "mine/Tiny-v0"
 SCRIPT = '''
@@ -122,6 +122,6 @@ def test_a_script_with_a_custom_component_resumes(tmp_path):
     log = tmp_path / "log"
     path = write_baseline(tmp_path, init=counting(log))
     script = tmp_path / "script.py"
-    script.write_text(SCRIPT.format(changes=CHANGES, baseline=path, folder=str(tmp_path / "results")))
+    script.write_text(SCRIPT.format(changes=FAST, baseline=path, folder=str(tmp_path / "results")))
     subprocess.run([sys.executable, str(script)], check=True, capture_output=True)
     assert count(log) == 2

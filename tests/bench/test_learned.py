@@ -13,7 +13,7 @@ from eitbench.estimation import CalibrationFrame, apply_correction, compatible_p
 from eitbench.worlds import entry
 from eitbench.worlds.task import make_task
 
-from tiny_worlds import CHANGES
+from short import FAST
 
 ROOT = Path(__file__).parents[2]
 ID = "eitbench/Pipe2DBiasedVelocity-v0"
@@ -92,7 +92,7 @@ def test_a_seed_repeats_and_something_is_learned(study, data, likelihood):
 @pytest.fixture(scope="module")
 def short(study):
     """A short episode, three modes, and the data that training stores."""
-    examples = eitbench.dataset("eitbench/Pipe2D-v0", "train:0", world=CHANGES)
+    examples = eitbench.dataset("eitbench/Pipe2D-v0", "train:0", world=FAST)
     (example,) = examples
     random = np.random.default_rng(0)
     root = np.linalg.cholesky(examples.mass.toarray())
@@ -138,7 +138,7 @@ def test_lagged_modes_are_of_the_same_state(study, short, monkeypatch):
 @pytest.mark.parametrize("changes, assumed, accepted", [
     ({"schedule": {"scored_steps": 5}, "instrument": {"noise_relative": 0.02}}, {}, True),
     ({}, {"mean_velocity": 4.0}, False),
-    (CHANGES, {}, False),
+    (FAST, {}, False),
 ])
 def test_networks_are_compatible_with_their_training_task(changes, assumed, accepted):
     """Episodes of other lengths are accepted; other vessels and flow models are rejected."""

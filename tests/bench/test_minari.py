@@ -8,7 +8,7 @@ from eitbench.cli.app import app
 from eitbench.worlds.registry import published_returns
 from typer.testing import CliRunner
 
-from short import SHORT, shorten
+from short import shorten
 
 minari = pytest.importorskip("minari", reason="needs the extra minari")
 
@@ -18,7 +18,7 @@ NAME = "eitbench/tiny/random-pair-v0"
 
 @pytest.fixture(autouse=True)
 def _short(monkeypatch, tmp_path):
-    shorten(monkeypatch, {ENV: SHORT["Pipe2D"]})
+    shorten(monkeypatch, ENV)
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
 
 

@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pandas as pd
 import pytest
-from eitbench.bench import run, runner
+from eitbench.bench import runner
 from eitbench.bench.methods import builtin_methods, load_method
 from eitbench.bench.run import Job, run_jobs
 from eitbench.bench.store import EpisodeStore
@@ -18,18 +18,12 @@ from eitbench.report.policies import adaptivity_gap, errors_by_policy, gap_text,
 from eitbench.worlds.catalogue import PIPE_2D
 from scipy.stats import t as student
 
-from injection_envs import filter_of, injected
-from short import merged
+from injection_envs import BUDGET, CURRENTS, FAULTS, FLOW, INFLOW, NAME, TANK, filter_of, injected
+from short import merged, world
 
-NAME, INFLOW = "eitbench/Pipe2DInjection-v0", "eitbench/Pipe2DInjectionInflow-v0"
-CURRENTS, FAULTS, BUDGET = (f"eitbench/Pipe2DInjection{kind}-v0" for kind in ("Currents", "Faults", "Budget"))
-FLOW = "eitbench/Pipe2DInjectionFlow-v0"
-SHORT = {"world": {"flow": {"mean_velocity": 16.0}, "schedule": {"scored_steps": 4}}}
-"""Sixteen electrodes and a short episode."""
-KWARGS = {NAME: SHORT, INFLOW: SHORT, CURRENTS: SHORT, FAULTS: SHORT,
-          BUDGET: merged(SHORT, {"world": {"schedule": {"budget": 3}}}),
-          FLOW: {"world": merged(SHORT["world"], {"flow": {"velocity_range": [15.0, 17.0]}})},
-          "eitbench/RotatingTankInjection-v0": {"world": {"schedule": {"warm_up": 2, "scored_steps": 3}}}}
+SHORT = world(NAME)
+KWARGS = {name: world(name) for name in (NAME, INFLOW, CURRENTS, FAULTS, FLOW, TANK)} | {
+    BUDGET: merged(world(BUDGET), {"world": {"schedule": {"budget": 3}}})}
 SEED = 5
 
 
@@ -70,17 +64,11 @@ def test_belief_is_the_filter_inside(name):
     observation, _ = env.reset(seed=SEED)
     belief = Belief(env.rules, observation)
     for pair in (7, 100, None if env.rules.budget else 3, 7):
-        predicted = belief.predict_covariance()
         observation, *_ = env.step(env.rules.action(pair))
         belief.update(observation)
         inside = filter_of(env)
         np.testing.assert_array_equal(belief.mean, inside.means()[0])
         np.testing.assert_array_equal(filter_of(belief).covariance, inside.covariance)
-        if name == NAME:                         # the predicted covariance: no measurement was rejected
-            expected = inside.covariance
-            np.testing.assert_allclose(belief.posterior_covariance(predicted, pair), expected,
-                                       atol=2e-5 * np.abs(expected).max())
-            assert belief.design_criteria(predicted)[0][pair] == pytest.approx((predicted - expected).trace(), rel=1e-3)
 
 
 def test_faulty_electrodes_have_no_design_criterion():
@@ -171,14 +159,13 @@ def test_an_even_budget_is_spent_exactly(budget):
 @pytest.mark.parametrize("name", list(KWARGS))
 @pytest.mark.parametrize("policy", builtin_methods("injection"))
 def test_policies_run_in_compatible_environments(policy, name, monkeypatch):
-    """Actions are valid, reproducible to the bit, and within the budget; incompatible environments are rejected."""
+    """Actions are valid and within the budget; incompatible environments are rejected."""
     env = environment(name)
     if not load_method(policy, "injection").suits(env.rules):
         with pytest.raises(ValueError, match=f"policy {policy} does not suit {name}"):
             injected(name, KWARGS[name], policy, SEED, "reduced")
         return
-    taken, again = (actions_of(name, policy, monkeypatch) for _ in range(2))
-    np.testing.assert_array_equal(taken, again)
+    taken = actions_of(name, policy, monkeypatch)
     dtype = np.float32 if env.rules.limit else np.int64
     assert all(env.action_space.contains(action.astype(dtype)) for action in taken)
 
@@ -201,8 +188,8 @@ def jobs_of(policies: list[str], seeds: str, **kwargs) -> list[Job]:
             for policy in policies for seed in parse_seeds(seeds)]
 
 
-def test_finished_episodes_are_stored(tmp_path, monkeypatch):
-    """The record has the same format as for estimators; stored episodes are not rerun, except interrupted ones."""
+def test_finished_episodes_are_stored(tmp_path):
+    """The record has the same format as for estimators."""
     store = EpisodeStore(tmp_path / "new")
     todo = jobs_of(["opposite", "adjacent"], "dev:1,0", estimator="reduced")
     run_jobs(todo, store, command="eitbench run")
@@ -216,18 +203,6 @@ def test_finished_episodes_are_stored(tmp_path, monkeypatch):
     assert record["environment"]["kwargs"]["estimator"] == "reduced"
     assert record["episodes"][0]["scores"]["spent"] == played.n_injections > 0
     assert record["episodes"][0]["step_errors"] == played.errors.tolist()
-
-    next(store.folder.glob("episodes/*/opposite/dev-1.json")).write_text("{")
-    again = []
-    monkeypatch.setattr(run, "run_method", lambda *asked: again.append(asked) or runner.run_method(*asked))
-    run_jobs(todo, store)
-    pd.testing.assert_frame_equal(policy_rows(todo, store.results()).drop(columns="seconds_per_step"),
-                                  rows.drop(columns="seconds_per_step"))
-    assert len(again) == 1
-    exact = jobs_of(["opposite"], "dev:1")
-    run_jobs(exact, store)
-    assert len(policy_rows(exact, store.results())) == 1
-    assert [json.loads(asked.kwargs).get("estimator") for asked, *_ in again] == ["reduced", None]
 
 
 def test_a_mistake_is_the_result_of_its_policy(tmp_path):

@@ -21,8 +21,8 @@ from eitbench.worlds.task import Estimate, Task
 from scipy.optimize import minimize_scalar
 
 from recorded import forget_made
-from short import merged
-from tiny import FILTER, FIXED_LAG, SCENARIO, SMOOTHING, count, counting, write_baseline
+from short import FAST, merged
+from tiny import FILTER, FIXED_LAG, SMOOTHING, count, counting, write_baseline
 
 
 @pytest.fixture
@@ -51,6 +51,13 @@ def baseline_of(update, boards=("filter",)):
 # -- errors of estimators ---------------------------------------------------------------------------------------------
 
 
+@pytest.fixture(scope="module")
+def good(tmp_path_factory):
+    """The path of a valid estimator, and its scores alone."""
+    path = write_baseline(tmp_path_factory.mktemp("good"), "good")
+    return path, scores_of(run_episode(Job(FILTER, path, 1))[0])
+
+
 @pytest.mark.parametrize(("update", "message"), [
     ("raise RuntimeError('the pump is off')", "RuntimeError: the pump is off"),
     ("raise SystemExit('too large')", "SystemExit: too large"),
@@ -69,14 +76,14 @@ def baseline_of(update, boards=("filter",)):
     ("return Estimate(self.level, None, voltages, -np.eye(4))", "covariance must be positive definite"),
     ("return Estimate(self.level, None, voltages, np.ones((4, 4)))", "covariance must be positive definite"),
 ])
-def test_an_error_affects_only_its_estimator(update, message, store, tmp_path):
+def test_an_error_affects_only_its_estimator(update, message, store, tmp_path, good):
     """Every error of an estimator is recorded with the reason; the run continues, and other scores do not change."""
-    good, bad = write_baseline(tmp_path, "good"), write_baseline(tmp_path, "bad", update=update)
-    run_jobs([Job(FILTER, bad, 1), Job(FILTER, good, 1)], store)
+    bad = write_baseline(tmp_path, "bad", update=update)
+    run_jobs([Job(FILTER, bad, 1), Job(FILTER, good[0], 1)], store)
     failed, fine = sorted(store.results(), key=lambda result: result["status"])
     assert (failed["method"], failed["status"], fine["status"]) == ("bad", "failed", "ok")
     assert re.search(message, failed["message"])
-    assert scores_of(fine) == scores_of(run_episode(Job(FILTER, good, 1))[0])
+    assert scores_of(fine) == good[1]
 
 
 def test_only_scored_states_need_a_variance(tmp_path):
@@ -86,7 +93,7 @@ def test_only_scored_states_need_a_variance(tmp_path):
     (claimed, fields), (unclaimed, _) = (
         run_episode(Job(FILTER, write_baseline(tmp_path, update=late.format(first)), 1)) for first in (2, 3))
     claimed, unclaimed = claimed["scores"], unclaimed["scores"]
-    warm_up = PIPE_2D.with_changes(SCENARIO).warm_up
+    warm_up = PIPE_2D.with_changes(FAST).warm_up
     assert warm_up == 2 and np.isnan(fields["std"][:warm_up]).all() and (fields["std"][warm_up:] == 2).all()
     calibration = ("crps", "coverage_50", "coverage_90", "spread_ratio")
     assert all(claimed[name] is not None for name in calibration)
@@ -130,13 +137,12 @@ def test_estimators_receive_the_task_and_measurements_only(environment):
 
 
 BIASED = Environment("eitbench/Pipe2DSmoothing-v0",
-                     json.dumps({"world": SCENARIO, "assume": {"mean_velocity": 30.0}}))
+                     json.dumps({"world": FAST, "assume": {"mean_velocity": 30.0}}))
 
 
-@pytest.mark.parametrize("environment", [FILTER, FIXED_LAG, SMOOTHING, BIASED],
-                         ids=["filter", "fixed-lag", "smoothing", "biased"])
+@pytest.mark.parametrize("environment", [FIXED_LAG, BIASED], ids=["fixed-lag", "biased"])
 def test_oracle_with_the_true_model(environment):
-    """For every subtrack and assumption of the task, the oracle equals the smoother of the most probable inflow with
+    """For any lag and assumption of the task, the oracle equals the smoother of the most probable inflow with
     the true velocity."""
     reference, _ = run_episode(Job(environment, "true_model_smoother", 3))
     smoother, _ = run_episode(Job(SMOOTHING, "inflow_smoother", 3))
@@ -148,7 +154,7 @@ def test_oracle_with_the_true_model(environment):
 def test_oracle_in_a_changing_flow(vessel):
     """Its error is smaller than the filter's with the first guess, and it returns the true flow; also if the inlet
     differs from the inlet of the fitted prior."""
-    changes = merged(SCENARIO, {"schedule": {"scored_steps": 12}, "flow": {"velocity_range": [30.0, 60.0]},
+    changes = merged(FAST, {"schedule": {"scored_steps": 12}, "flow": {"velocity_range": [30.0, 60.0]},
                                 "vessel": vessel})
     world = Environment("eitbench/Pipe2DTimeVaryingVelocity-v0", json.dumps({"world": changes}))
     reference, guessing = (run_episode(Job(world, name, 3))[0]["scores"]
@@ -170,13 +176,11 @@ def test_modified_arrays_of_estimators_change_nothing(tmp_path):
     np.testing.assert_array_equal(rude_fields["mean"], fields["mean"])
 
 
-def test_estimators_cannot_change_the_task_of_others(tmp_path):
+def test_estimators_cannot_change_the_task_of_others(tmp_path, good):
     """An estimator that overwrites the shared injection pattern affects at most its own results."""
-    good = write_baseline(tmp_path, "good")
-    before = scores_of(run_episode(Job(FILTER, good, 1))[0])
     run_episode(Job(FILTER, write_baseline(tmp_path, "vandal", init="task.currents[:] *= 3.0"), 1))
     try:
-        assert scores_of(run_episode(Job(FILTER, good, 1))[0]) == before
+        assert scores_of(run_episode(Job(FILTER, good[0], 1))[0]) == good[1]
     finally:
         forget_made(runner)                                    # remake the modified environment for other tests
 
@@ -210,7 +214,7 @@ def tilted(tmp_path_factory):
         store = EpisodeStore(folder)
         run_jobs([Job(FILTER, path, 4)], store)
         (result,) = store.results()
-        return result, store.fields(result)["mean"].astype(float), simulate(PIPE_2D.with_changes(SCENARIO), 4)
+        return result, store.fields(result)["mean"].astype(float), simulate(PIPE_2D.with_changes(FAST), 4)
 
 
 def squared(mesh, values):
@@ -256,17 +260,6 @@ def test_scores_can_be_recomputed_from_what_is_stored(tilted):
     assert result["scores"]["contrast_error"] == pytest.approx(contrast, rel=1e-5)
     computed = np.array([env.task.observation.voltages(means[i], currents[i:i + 1])[0] for i in range(5)])
     assert result["scores"]["voltage_discrepancy"] == pytest.approx(((voltages - computed)[2:]**2).mean(), rel=1e-9)
-
-
-def test_minus_the_mean_reward_is_the_error(tilted):
-    """The environment's rewards, from load vectors in single precision, agree with the error on the leaderboard."""
-    result, means, _ = tilted
-    env = FILTER.make()
-    env.reset(seed=4)
-    rewards = [env.step(mean)[1] for mean in means]
-    assert rewards[:2] == [0.0, 0.0]
-    assert -np.mean(rewards[2:]) == pytest.approx(result["scores"]["error"], rel=1e-7)
-    np.testing.assert_allclose(result["step_errors"], -np.array(rewards[2:]), rtol=1e-7)
 
 
 # -- resuming ---------------------------------------------------------------------------------------------------------

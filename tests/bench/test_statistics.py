@@ -1,11 +1,6 @@
 """Statistics of a leaderboard: comparison with hand-computed numbers and brute force, and coverage of intervals."""
 
-import json
 import math
-import os
-import subprocess
-import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -110,26 +105,6 @@ def test_too_few_episodes_have_no_interval():
     assert paired_probability_of_improvement({"pipe": seeded(a)}, {"pipe": seeded(a + 1)}) == (1.0, 0.0, 1.0)
 
 
-def everything():
-    """Return one interval of each kind."""
-    a, b = two_methods()
-    return [stratified_bootstrap(plain(a), interquartile_mean), stratified_bootstrap(plain(a), mean_over_environments),
-            paired_difference(a, b), paired_probability_of_improvement(a, b)]
-
-
-def test_the_same_numbers_in_another_process():
-    """The intervals are equal to the last bit for other hashes of strings; another seed gives other intervals."""
-    here = json.loads(json.dumps(everything()))
-    code = "import json; from test_statistics import everything; print(json.dumps(everything()))"
-    environment = os.environ | {"PYTHONHASHSEED": "1", "PYTHONPATH": os.pathsep.join(path for path in sys.path if path)}
-    done = subprocess.run([sys.executable, "-c", code], cwd=Path(__file__).parent, env=environment, capture_output=True,
-                          text=True, check=False)
-    assert done.returncode == 0, done.stderr
-    assert json.loads(done.stdout) == here
-    a, b = two_methods()
-    assert paired_difference(a, b, seed=1)[0] == here[2][0] and paired_difference(a, b, seed=1)[1:] != here[2][1:]
-
-
 # -- pairs ------------------------------------------------------------------------------------------------------------
 
 
@@ -170,10 +145,10 @@ def test_paired_difference_of_interquartile_means():
     cut = tail_percent((12, 20, 9))
     theirs = tuple(np.percentile(differences, [cut, 100 - cut]))
     assert (low, high) == pytest.approx(theirs, abs=4 * 0.05 * np.std(differences))
-    assert paired_difference(shuffled(a, random), shuffled(b, random), statistic=interquartile_mean) == (
-        value, low, high)
     same = paired_difference(a, b, statistic=mean_over_environments)
     assert same == paired_difference(a, b) and same[0] != value
+    other = paired_difference(a, b, seed=1)
+    assert other[0] == same[0] and other[1:] != same[1:]
 
 
 @pytest.mark.parametrize("statistic", [mean_over_environments, interquartile_mean])

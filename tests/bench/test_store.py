@@ -19,7 +19,8 @@ from eitbench.bench.tracks import Environment
 from eitbench.data.cache import CACHE_VARIABLE
 from eitbench.data.seeds import format_seed
 
-from tiny import FILTER, FIXED_LAG, RUN, SCENARIO, git_says, sha, write_baseline
+from short import FAST
+from tiny import FILTER, FIXED_LAG, RUN, git_says, sha, write_baseline
 
 ENV, COMMAND = "eitbench/Pipe2D-v0", "eitbench run --seeds train:1-2"
 
@@ -149,7 +150,7 @@ def played(tmp_path_factory):
 def test_records_can_be_reproduced(played):
     """Environment with arguments, estimator with parameters and hash, command, seeds, versions, commit, machine."""
     bad, mine = sorted(played.write_records(), key=lambda record: record["method"])
-    assert mine["environment"]["id"] == ENV and mine["environment"]["kwargs"]["world"] == SCENARIO
+    assert mine["environment"]["id"] == ENV and mine["environment"]["kwargs"]["world"] == FAST
     assert (mine["method"], mine["title"], mine["board"]) == ("mine", "Mine", "filter")
     assert mine["parameters"] == {"alpha": 0.5, "order": [1, 2]}
     assert len(mine["method_sha256"]) == 64 and mine["method_sha256"] != bad["method_sha256"]
@@ -271,7 +272,7 @@ def test_provenance_without_git(monkeypatch):
 def test_arguments_of_an_environment_make_other_records(store, tmp_path):
     """Other keyword arguments of an id are another world: neither results nor records are overwritten."""
     path = write_baseline(tmp_path)
-    wider = Environment(FILTER.id, json.dumps({"world": SCENARIO | {"instrument": {"noise_relative": 0.02}}}))
+    wider = Environment(FILTER.id, json.dumps({"world": FAST | {"instrument": {"noise_relative": 0.02}}}))
     run_jobs([Job(environment, path, 1) for environment in (FILTER, wider, FIXED_LAG)], store)
     records = store.write_records()
     noise = [record["environment"]["kwargs"]["world"].get("instrument", {}).get("noise_relative") for record in records]

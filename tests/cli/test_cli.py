@@ -19,17 +19,13 @@ from eitbench.worlds import entry, registry
 from typer.main import get_command
 
 from commands import eitbench
-from short import PLAIN, shorten, world
+from short import PLAIN, shorten
 from tiny import git_says, write_baseline
 
 ROOT = Path(__file__).parents[2]
 PIPE, INJECTION = "eitbench/Pipe2D-v0", "eitbench/Pipe2DInjection-v0"
 COMMANDS = ("list", "run", "bank", "train", "submit", "verify", "golden",
             "fit", "estimate", "export", "leaderboard", "compare", "render")
-TINY = {"flow": {"mean_velocity": 45.0}, "schedule": {"scored_steps": 3, "pattern": {"frame": 2}},
-        "vessel": {"electrodes_per_wall": 2}}
-"""A fast flow with a residence time of two steps: an episode of five takes a third of a second."""
-
 MINE = '''"""My method: the expected level everywhere."""
 import numpy as np
 from eitbench import Estimate
@@ -47,7 +43,7 @@ class Estimator:
 def tiny_world(monkeypatch, tmp_path):
     """Use tiny worlds for the registered ids, an empty folder, and no git."""
     git_says(monkeypatch)
-    shorten(monkeypatch, {name: TINY if name in PLAIN else world(name)["world"] for name in ids()})
+    shorten(monkeypatch, *ids())
     lagged = replace(entry("eitbench/Pipe2DFixedLag-v0"), settings={"lag": 2})
     registry.import_entries([lagged])
     monkeypatch.chdir(tmp_path)
@@ -246,17 +242,6 @@ def test_a_missing_extra_is_reported(monkeypatch, tmp_path):
     code, said, complaint = eitbench("train", "--env", INJECTION)
     assert code == 1 and said == "" and "needs the extra bench, pip install 'eitbench[bench]'" in complaint
     assert not (tmp_path / "results").exists()
-
-
-def test_same_command_resumes(tmp_path):
-    """The second command runs nothing; one more seed is one more episode."""
-    assert run_mine()[0] == 0
-    before = sorted(path.stat().st_mtime_ns for path in (tmp_path / "results" / "episodes").rglob("*.json"))
-    _, said, complaint = run_mine()
-    assert "2 of 2 episodes are already stored" in said + complaint
-    run_mine("--seeds", "dev:0-2")
-    after = sorted(path.stat().st_mtime_ns for path in (tmp_path / "results" / "episodes").rglob("*.json"))
-    assert len(before) == 2 and len(after) == 3 and after[:2] == before
 
 
 def test_module_can_be_run(monkeypatch, capsys):

@@ -9,7 +9,7 @@ from eitbench.report.sweep import swept_parameter
 from typer.testing import CliRunner
 
 from short import shorten
-from tiny import SCENARIO, git_says, write_baseline
+from tiny import git_says, write_baseline
 
 PIPE = "eitbench/Pipe2D-v0"
 HELPER = "import numpy as np; print('one', end=' '); print('\\x1b[31mtwo'); np.linalg.inv(np.zeros((2, 2)))"
@@ -20,7 +20,7 @@ def tiny_world(monkeypatch, tmp_path):
     """Use a world of five steps, in an empty folder; 80 columns."""
     git_says(monkeypatch)
     monkeypatch.setenv("COLUMNS", "80")
-    shorten(monkeypatch, {PIPE: SCENARIO})
+    shorten(monkeypatch, PIPE)
     monkeypatch.chdir(tmp_path)
 
 

@@ -18,8 +18,7 @@ from eitbench.data.episode_cache import cached_episode, integrals, region_operat
 from eitbench.data.episodes import simulate
 from eitbench.data.export import export
 
-from short import WANDERING
-from tiny_worlds import CHANGES, FAST
+from short import DRAWN, FAST, WANDERING
 
 PIPE = "eitbench/Pipe2D-v0"
 REGION = "eitbench/Pipe2DInjectionFlow-v0"
@@ -28,11 +27,11 @@ REGION = "eitbench/Pipe2DInjectionFlow-v0"
 @pytest.fixture(scope="module")
 def tiny():
     """Return a data set of two episodes of five steps."""
-    return eitbench.dataset(PIPE, "train:0-1", world=CHANGES)
+    return eitbench.dataset(PIPE, "train:0-1", world=FAST)
 
 
 def test_they_are_what_the_environment_shows_and_scores(tiny):
-    env = gym.make(PIPE, world=CHANGES)
+    env = gym.make(PIPE, world=FAST)
     random = np.random.default_rng(0)
     for example in tiny:
         observation, _ = env.reset(seed=example.seed)
@@ -48,7 +47,7 @@ def test_they_are_what_the_environment_shows_and_scores(tiny):
     assert [example.seed for example in tiny] == [0, 1] and tiny[-1].seed == 1
 
 
-@pytest.mark.parametrize("env, changes", [(PIPE, CHANGES), (REGION, WANDERING)])
+@pytest.mark.parametrize("env, changes", [(PIPE, FAST), (REGION, WANDERING)])
 def test_truth_is_the_best_there_is_on_these_nodes(env, changes):
     """The residual is orthogonal to all nodal functions, over the scored region of the truth's mesh."""
     examples = eitbench.dataset(env, "train:0", world=changes)
@@ -72,7 +71,7 @@ def test_errors_over_a_region_are_those_of_its_scores():
     np.testing.assert_allclose(examples.errors(example, estimate), expected, rtol=1e-6)
 
 
-@pytest.mark.parametrize("env, changes", [(PIPE, CHANGES), (REGION, WANDERING)])
+@pytest.mark.parametrize("env, changes", [(PIPE, FAST), (REGION, WANDERING)])
 def test_scores_are_the_same_in_few_coordinates(env, changes):
     """Errors of estimates in the span of a basis, orthonormal or not, about any mean."""
     examples = eitbench.dataset(env, "train:0", world=changes)
@@ -91,7 +90,7 @@ def test_scores_are_the_same_in_few_coordinates(env, changes):
     assert reduced[0].truth.shape == (len(example.voltages), 3)
 
 
-@pytest.mark.parametrize("env, changes", [(PIPE, CHANGES), (REGION, WANDERING)])
+@pytest.mark.parametrize("env, changes", [(PIPE, FAST), (REGION, WANDERING)])
 def test_modes_are_the_best_basis(env, changes):
     """Modes are orthonormal over the scored region; the residual equals the omitted singular values, and all of them
     nothing."""
@@ -121,7 +120,7 @@ def test_invalid_bases_are_explained(tiny, basis, mean, message):
 
 def test_examples_contain_a_requested_flow():
     """A parabola is in the span of the profiles, so that the fit is exact."""
-    examples = eitbench.dataset("eitbench/Pipe2DUnknownVelocity-v0", "train:0", world=FAST)
+    examples = eitbench.dataset("eitbench/Pipe2DUnknownVelocity-v0", "train:0", world=DRAWN)
     profiles = examples.world.velocity_model.profiles
     there = simulate(examples.world, 0).velocity
     np.testing.assert_allclose(examples[0].velocity @ profiles.T, there, rtol=1e-9)
@@ -155,7 +154,7 @@ def test_iterating_simulates_few_at_a_time(monkeypatch, tmp_path):
         return simulated(world, seeds, *more)
 
     monkeypatch.setattr(presimulation, "simulate_batch", counting)
-    stream = iter(eitbench.dataset(PIPE, "train:0-8", world=CHANGES))
+    stream = iter(eitbench.dataset(PIPE, "train:0-8", world=FAST))
     assert next(stream).seed == 0 and asked == [list(range(8))]
     assert [example.seed for example in stream] == list(range(1, 9)) and asked[1:] == [[8]]
 
@@ -186,7 +185,7 @@ def read(path):
 
 @pytest.mark.parametrize("format, suffix", [("npz", "npz"), ("hdf5", "h5")])
 def test_files_hold_the_same_and_more_can_be_added(tiny, tmp_path, format, suffix):
-    first = eitbench.dataset(PIPE, "train:0", world=CHANGES)
+    first = eitbench.dataset(PIPE, "train:0", world=FAST)
     folder = tmp_path / "out"
     assert export(first, folder, format) == 1
     before = (folder / f"train-0.{suffix}").stat().st_mtime_ns

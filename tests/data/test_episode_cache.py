@@ -24,8 +24,8 @@ from eitbench.data.episodes import cached_truth_model, simulate
 from eitbench.worlds import entry
 
 from recorded import bits
-from short import merged, short
-from tiny_worlds import CHANGES, TINY
+from short import FAST, WANDERING, merged
+from tiny_worlds import TINY
 
 pytestmark = pytest.mark.usefixtures("place")
 
@@ -137,7 +137,7 @@ def test_cached_episodes_need_no_finite_elements(episode):
     """Environments build no mesh if the episode and the scoring constants are cached."""
     cached_episode(TINY, 7), scoring_constants(TINY)
     program = (f"import sys, gymnasium as gym, numpy as np, eitbench\n"
-               f"env = gym.make('eitbench/Pipe2D-v0', world={CHANGES!r})\n"
+               f"env = gym.make('eitbench/Pipe2D-v0', world={FAST!r})\n"
                "env.reset(seed=7)\n"
                "rewards = [env.step(np.full(1701, 30.0))[1] for _ in range(5)]\n"
                "heavy = {'skfem', 'numba', 'eitbench.numerics.mesh'}\n"
@@ -146,17 +146,15 @@ def test_cached_episodes_need_no_finite_elements(episode):
     assert done.stdout == "True []\n"
 
 
-def longer(id):
-    """Changes to a world of some 20 steps; the tank keeps its electrodes, for which a filter is shipped."""
-    if "Tank" in id:
-        return {"schedule": {"warm_up": 1, "scored_steps": 18}}
-    return merged(short(id)["world"], {"schedule": {"scored_steps": 18}})
+LONGER = {id: merged(changes, {"schedule": {"scored_steps": 18}}) for id, changes in {
+    "eitbench/Pipe2DFixedLag-v0": FAST, "eitbench/Pipe2DInjectionFlow-v0": WANDERING,
+    "eitbench/RotatingTankInjection-v0": {"schedule": {"warm_up": 1}}, "eitbench/StationaryTank2D-v0": {}}.items()}
+"""Changes to worlds of some 20 steps."""
 
 
-@pytest.mark.parametrize("id", ["eitbench/Pipe2DFixedLag-v0", "eitbench/Pipe2DInjectionFlow-v0",
-                                "eitbench/RotatingTankInjection-v0", "eitbench/StationaryTank2D-v0"])
+@pytest.mark.parametrize("id", LONGER)
 def test_first_steps_have_the_bits_of_the_whole(id):
-    world = entry(id).world.with_changes(longer(id))
+    world = entry(id).world.with_changes(LONGER[id])
     begun = cached_episode_prefix(world, 3, 1)
     assert len(begun) == 1 + EXTRA_STEPS and not is_episode_cached(world, 3)
     states = [concentration_at(world, 3, t, 1) for t in (0, 1 + EXTRA_STEPS)]
@@ -174,10 +172,10 @@ def test_first_steps_have_the_bits_of_the_whole(id):
     ("eitbench/RotatingTankInjection-v0", {})])
 def test_episodes_are_the_same_with_and_without_a_cache(id, kwargs):
     """Observations and rewards are bit-identical; an episode is not cached before a step needs it."""
-    world = entry(id).world.with_changes(longer(id))
+    world = entry(id).world.with_changes(LONGER[id])
 
     def played():
-        env = gym.make(id, world=longer(id), **kwargs)
+        env = gym.make(id, world=LONGER[id], **kwargs)
         observation, _ = env.reset(seed=4)
         env.action_space.seed(0)
         seen = [observation]

@@ -16,7 +16,8 @@ from eitbench.worlds.catalogue import PIPE_2D
 from eitbench.worlds.world import Discretisation
 from scipy.stats import kstest
 
-from tiny_worlds import CHANGES, TINY
+from short import FAST
+from tiny_worlds import TINY
 
 pytestmark = pytest.mark.usefixtures("place")
 
@@ -49,7 +50,7 @@ def test_other_processes_same_bits_and_share_one_file(episode, place):
     program = ("from eitbench.worlds.catalogue import PIPE_2D\n"
                "from eitbench.data.episodes import simulate\n"
                "import hashlib\n"
-               f"episode = simulate(PIPE_2D.with_changes({CHANGES!r}), 7)\n"
+               f"episode = simulate(PIPE_2D.with_changes({FAST!r}), 7)\n"
                "print(hashlib.sha256(b''.join(array.tobytes() for array in episode)).hexdigest())")
     running = [subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE, text=True) for _ in range(2)]
     digests = [process.communicate()[0].strip() for process in running]

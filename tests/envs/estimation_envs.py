@@ -7,28 +7,19 @@ from eitbench.worlds import entries, entry
 from short import short
 
 ESTIMATION = [id for id, each in entries().items() if each.track == "estimation"]
-AT_HOME = [id for id in ESTIMATION if not entry(id).nominal]
-"""Ids without shifted environments, which have the same classes and differ in parameters only."""
-PIPE, BIASED = "eitbench/Pipe2D-v0", "eitbench/Pipe2DBiasedVelocity-v0"
+PIPE, LAGGED, SMOOTHING = (f"eitbench/Pipe2D{lag}-v0" for lag in ("", "FixedLag", "Smoothing"))
+BIASED, UNKNOWN, SKEWED = (f"eitbench/Pipe2D{kind}Velocity-v0" for kind in ("Biased", "Unknown", "Skewed"))
+OBSTACLE, SOLID = "eitbench/Pipe2DObstacle-v0", "eitbench/Pipe3D-v0"
+STIRRED, STILL = "eitbench/RotatingTank2D-v0", "eitbench/StationaryTank2D-v0"
+KINDS = [PIPE, LAGGED, SMOOTHING, UNKNOWN, SKEWED, OBSTACLE, SOLID, STIRRED, STILL]
+"""One id of each kind of lag, flow, vessel and target; the others differ in numbers only."""
 VELOCITY = [id for id in ESTIMATION if entry(id).world.velocity_model is not None]
 """Ids whose task requests the flow too."""
-UNKNOWN, SKEWED = "eitbench/Pipe2DUnknownVelocity-v0", "eitbench/Pipe2DSkewedVelocity-v0"
 
 
 def make(name: str, **kwargs) -> gym.Env:
     """Make the environment of an id on its short world, with two training episodes."""
     return gym.make(name, **short(name) | kwargs)
-
-
-def play(env: gym.Env, seed: int, actions: np.ndarray) -> list[tuple]:
-    """Return (observation, reward, terminated, truncated, info) of each step of an episode under these actions."""
-    observation, info = env.reset(seed=seed)
-    steps = [(observation, 0.0, False, False, info)]
-    for action in actions:
-        steps.append(env.step(action))
-        if steps[-1][2]:
-            break
-    return steps
 
 
 def noise_actions(env: gym.Env, seed: int = 0) -> np.ndarray:

@@ -8,31 +8,19 @@ import sys
 import gymnasium as gym
 import numpy as np
 import pytest
+from estimation_envs import LAGGED, PIPE, SKEWED
 
-import injection_envs
-from short import short
+from injection_envs import FAULTS, FLOW, INFLOW, NAME
+from short import WANDERING, short
 
-PIPE, SKEWED, TANK = "eitbench/Pipe2D-v0", "eitbench/Pipe2DSkewedVelocity-v0", "eitbench/RotatingTank2D-v0"
-INJECTION, FLOW = "eitbench/Pipe2DInjection-v0", "eitbench/Pipe2DInjectionFlow-v0"
-INFLOW = "eitbench/Pipe2DInjectionInflow-v0"
-FAULTS, CURRENTS = "eitbench/Pipe2DInjectionFaults-v0", "eitbench/Pipe2DInjectionCurrents-v0"
-KINDS = [(PIPE, {}), ("eitbench/Pipe2DFixedLag-v0", {"lag": 2}), (SKEWED, {}), (TANK, {}),
-         (INJECTION, {}), (INJECTION, {"estimator": "full", "observation": "raw"}), (INJECTION, {"estimator": "none"}),
-         ("eitbench/Pipe2DInjectionBudget-v0", {}), (FAULTS, {}), (CURRENTS, {}), (FLOW, {}),
-         (FLOW, {"estimator": "full"}), (INFLOW, {}), (INFLOW, {"estimator": "full"})]
+KINDS = [(LAGGED, {}), (SKEWED, {}), (NAME, {}), (NAME, {"estimator": "full", "observation": "raw"}), (FAULTS, {}),
+         (FLOW, {}), (FLOW, {"estimator": "full", "world": WANDERING}), (INFLOW, {}), (INFLOW, {"estimator": "full"})]
 COPIES = {"deepcopy": copy.deepcopy, "pickle": lambda env: pickle.loads(pickle.dumps(env))}
-copied = pytest.mark.parametrize("how", COPIES)
-
-
-def changes(name: str, given: dict) -> dict:
-    """Return arguments for short episodes; with a reduced filter, the world for which other tests build it."""
-    is_reduced = "Injection" in name and "estimator" not in given
-    return ({"world": injection_envs.world(name), "episodes": 2} if is_reduced else short(name)) | given
 
 
 def begun(name: str, given: dict, seed: int | None = 3):
     """Return an environment after a reset and one step, and actions for further steps."""
-    env = gym.make(name, **changes(name, given))
+    env = gym.make(name, **short(name) | given)
     env.reset(seed=seed)
     env.action_space.seed(0)
     actions = [env.action_space.sample() for _ in range(24)]
@@ -78,12 +66,11 @@ def test_a_copy_goes_on_as_the_original_would(name, given):
         assert other.unwrapped is not env.unwrapped and other.spec == env.spec
 
 
-@copied
-@pytest.mark.parametrize(("name", "given"), [(PIPE, {}), (INJECTION, {}), (INJECTION, {"threads": 2}), (FLOW, {}),
-                                             (INFLOW, {"threads": 2})])
+@pytest.mark.parametrize("how", COPIES)
+@pytest.mark.parametrize(("name", "given"), [(PIPE, {}), (NAME, {}), (INFLOW, {"threads": 2})])
 def test_vector_environments(name, given, how):
     """Copies of vector environments are equal too, with or without threads, also beyond the episode's end."""
-    envs = gym.make_vec(name, num_envs=3, vectorization_mode="vector_entry_point", **changes(name, given))
+    envs = gym.make_vec(name, num_envs=3, vectorization_mode="vector_entry_point", **short(name) | given)
     envs.reset(seed=1)
     envs.action_space.seed(0)
     actions = [envs.action_space.sample() for _ in range(9)]
@@ -94,10 +81,9 @@ def test_vector_environments(name, given, how):
         each.close()
 
 
-@pytest.mark.parametrize("name", [PIPE, INJECTION])
-def test_in_another_process(name, tmp_path):
+def test_in_another_process(tmp_path):
     """A pickled environment continues in another process."""
-    env, actions = begun(name, {})
+    env, actions = begun(NAME, {})
     (tmp_path / "env").write_bytes(pickle.dumps((env, actions)))
     code = (f"import pathlib, pickle, sys\nimport eitbench\nhere = pathlib.Path({str(tmp_path)!r})\n"
             "env, actions = pickle.loads((here / 'env').read_bytes())\n"

@@ -1,12 +1,11 @@
-"""Invalid arguments and estimates of estimation environments are named."""
+"""Invalid arguments and estimates are named."""
 
 import gymnasium as gym
 import numpy as np
 import pytest
-from estimation_envs import BIASED, PIPE, UNKNOWN, make
+from estimation_envs import BIASED, OBSTACLE, PIPE, SOLID, STIRRED, UNKNOWN, make
 
-OBSTACLE, SOLID = "eitbench/Pipe2DObstacle-v0", "eitbench/Pipe3D-v0"
-STIRRED, STILL = "eitbench/RotatingTank2D-v0", "eitbench/StationaryTank2D-v0"
+from injection_envs import BUDGET, FAULTS, FLOW, INFLOW, NAME, TANK
 
 
 @pytest.mark.parametrize(("id", "change", "message"), [
@@ -27,7 +26,23 @@ STIRRED, STILL = "eitbench/RotatingTank2D-v0", "eitbench/StationaryTank2D-v0"
      "profiles must be None, 'mean' or 'three'"),
     (OBSTACLE, {"world": {"vessel": {"bulge": {"height": 0.06}}}}, "bulge.height must be"),
     (STIRRED, {"world": {"region": [0.1, 0.2]}}, "region must be None in a RoundTank"),
+    (NAME, {"estimator": "exact"}, "estimator must be one of reduced, full, none, got 'exact'"),
+    (NAME, {"gate": 0.0}, "gate must be"),
+    (NAME, {"world": {"instrument": {"current_norm": "L3"}}}, "current_norm must be one of L1, L2, Linf"),
+    (NAME, {"render_mode": "tv"}, "render_mode must be"),
+    (INFLOW, {"inflow": "pink"}, "inflow must be one of white, learned, got 'pink'"),
+    (FLOW, {"inflow": "learned"}, "inflow must be 'white' where the velocity is estimated too"),
+    (TANK, {"inflow": "learned"}, "inflow must be 'white' for a target without inflow"),
+    (FLOW, {"world": {"region": [0.283, 0.4]}}, "multiples of 0.01 m"),
+    (FLOW, {"world": {"flow": {"velocity_walk": 0.0}}}, "velocity_walk must be"),
+    (FAULTS, {"world": {"instrument": {"n_dead_range": [3, 2]}}}, "n_dead_range must be a range least ≤ most"),
+    (FAULTS, {"world": {"instrument": {"n_loose_range": [0, 12]}}},
+     "must leave two electrodes without fault, got up to 18 of 16"),
+    (FAULTS, {"world": {"instrument": {"n_loose_range": "01"}}},
+     r"n_loose_range must be a range \(least, most\), got '01'"),
+    (BUDGET, {"world": {"schedule": {"budget": -1}}}, "budget must be"),
 ])
+@pytest.mark.filterwarnings("ignore")
 def test_wrong_arguments_are_named(id, change, message):
     """An invalid argument is named before any computation."""
     with pytest.raises(ValueError, match=message):
@@ -70,4 +85,4 @@ def test_a_reset_is_required(ask):
     with pytest.raises(gym.error.ResetNeeded, match=r"call reset\(\) before step\(\)"):
         env.step(np.full(1701, 30.0))
     with pytest.raises(gym.error.ResetNeeded, match=r"call reset\(\) before error"):
-        make("eitbench/Pipe2DInjection-v0").unwrapped.error  # noqa: B018
+        make(NAME).unwrapped.error  # noqa: B018

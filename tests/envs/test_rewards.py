@@ -1,46 +1,33 @@
 """Rewards of estimates against integrals on the truth's mesh."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
-from eitbench import scoring
+from eitbench import Estimate, scoring
+from eitbench.bench.runner import run_estimator
+from eitbench.bench.scores import compute_scores
 from eitbench.data.episode_cache import score_operators
-from estimation_envs import AT_HOME, VELOCITY, best_velocity, make
-
-each_velocity = pytest.mark.parametrize("name", VELOCITY)
+from estimation_envs import KINDS, PIPE, SKEWED, UNKNOWN, best_velocity, make
 
 
-@pytest.fixture(scope="module", params=AT_HOME)
-def name(request):
-    """Return an id; all tests of one id run in sequence, while its meshes are cached."""
-    return request.param
-
-
-def test_action_has_one_number_per_node_and_flow_parameter(name):
-    """The action space (n + k,) is symmetric about zero: ten times the expected concentration and velocity."""
-    env = make(name)
-    task = env.unwrapped.task
-    n = task.mesh.n_nodes
-    velocity = env.unwrapped.world.velocity_model
-    k = 0 if velocity is None else velocity.n_parameters
-    assert task.velocity == velocity
-    assert env.unwrapped.n_nodes == n
-    assert env.action_space.shape == (n + k,)
-    expected = np.append(np.full(n, 10.0 * task.expected_concentration), np.full(k, 10.0 * 45.0))
-    np.testing.assert_array_equal(env.action_space.high, expected)
-    np.testing.assert_array_equal(env.action_space.low, -expected)
-
-
+@pytest.mark.parametrize("name", KINDS)
 def test_reward_is_minus_the_relative_error_of_the_requested_state(name):
     """Step i scores the state i − lag after the warm-up; the true state at the nodes has a reward of about 0.
 
     Its reward is the projection error on the coarser mesh, computed here on the truth's mesh; 1.5 times the state has
-    an error of a quarter. The best fit of the flow is part of the action, if it is requested.
+    an error of a quarter. The best fit of the flow is part of the action, if it is requested. The action space is ten
+    times the expected concentration and velocity, of either sign.
     """
     env = make(name)
     base = env.unwrapped
     env.reset(seed=1)
     truth = base.truth()
     task = base.task
+    n, k = task.mesh.n_nodes, 0 if task.velocity is None else task.velocity.n_parameters
+    bound = np.append(np.full(n, 10.0 * task.expected_concentration), np.full(k, 10.0 * 45.0))
+    np.testing.assert_array_equal(env.action_space.high, bound)
+    np.testing.assert_array_equal(env.action_space.low, -bound)
     to_truth, mass = score_operators(base.world)
     to_model = base.truth_mesh().interpolation_to(task.mesh.points)
     flow = best_velocity(base)
@@ -63,7 +50,7 @@ def test_reward_is_minus_the_relative_error_of_the_requested_state(name):
     assert scored == task.n_steps - task.warm_up == base.world.schedule.scored_steps
 
 
-@each_velocity
+@pytest.mark.parametrize("name", [UNKNOWN, SKEWED])
 def test_reward_has_a_second_term_for_the_flow(name):
     """−∫(v̂ − v)²/∫v² is added: 0 for the best fit, −1 for 0 and for twice the flow, else as by quadrature.
 
@@ -101,6 +88,47 @@ def test_reward_has_a_second_term_for_the_flow(name):
         np.testing.assert_array_equal(rewards[:task.warm_up], 0.0)
 
 
+def estimating(estimate) -> SimpleNamespace:
+    """Return a baseline whose estimates are all the same."""
+    return SimpleNamespace(make=lambda _: SimpleNamespace(update=lambda *_: estimate), privileged=False)
+
+
+@pytest.mark.parametrize(("name", "said"), [(UNKNOWN, None), (SKEWED, None), (SKEWED, 40.0)])
+def test_leaderboard_scores_what_is_rewarded(name, said, monkeypatch):
+    """ẽ_c + ẽ_v of the leaderboard equals minus the mean reward.
+
+    Without an estimate of the flow its prior mean is scored.
+    """
+    base = make(name).unwrapped
+    task = base.task
+    step = base.step
+    played = []
+    velocity = None if said is None else np.append(said, np.zeros(task.velocity.n_parameters - 1))
+    estimate = Estimate(np.full(task.mesh.n_nodes, 31.0), velocity=velocity)
+    monkeypatch.setattr(base, "step", lambda action: played.append((action, step(action))) or played[-1][1])
+    scores = compute_scores("estimation", run_estimator(base, estimating(estimate), 1).outcome)
+    rewards = np.array([reward for _, (_, reward, *_) in played])[task.warm_up:]
+    total = scores["error"] + scores["velocity_error"]
+    assert total == pytest.approx(-rewards.mean(), abs=1e-7)
+    assert scores["velocity_error"] > 1e-3
+    expected = task.velocity.nominal if said is None else velocity
+    for action, _ in played:
+        np.testing.assert_array_equal(action[task.mesh.n_nodes:], expected)
+
+
+@pytest.mark.parametrize(("id", "message"), [
+    (PIPE, "Estimate.velocity must be None where the flow is not estimated"),
+    (SKEWED, r"Estimate.velocity must have shape \(3,\)"),
+])
+def test_flow_is_rejected_where_it_is_not_requested(id, message):
+    """A velocity is rejected if it is not requested or has too few numbers."""
+    base = make(id).unwrapped
+    estimate = Estimate(np.full(base.task.mesh.n_nodes, 31.0), velocity=np.array([4.5]))
+    with pytest.raises(ValueError, match=message):
+        run_estimator(base, estimating(estimate), 1)
+
+
+@pytest.mark.parametrize("name", KINDS)
 def test_privileged_info_is_the_episode(name):
     """Oracles receive all observations of the episode and the true flow."""
     base = make(name).unwrapped

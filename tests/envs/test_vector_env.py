@@ -6,22 +6,16 @@ from itertools import combinations
 import gymnasium as gym
 import numpy as np
 import pytest
-from eitbench.data.episodes import simulate
 from eitbench.envs import estimation
 from eitbench.worlds import entry
-from eitbench.worlds.catalogue import PIPE_2D
 from eitbench.worlds.task import lag_steps
-from estimation_envs import AT_HOME, ESTIMATION, PIPE
+from estimation_envs import KINDS, LAGGED, PIPE, SMOOTHING
 from gymnasium.envs.registration import EnvSpec
 from gymnasium.vector import AutoresetMode
 
-from short import PIPE as CHANGES
-from short import PLAIN, short
+from short import short
 
-LAGS = [name for name in PLAIN if name in ESTIMATION]
-"""The plain pipe with its three lags, for properties that do not depend on the world."""
-TINY = PIPE_2D.with_changes(CHANGES)
-"""Seven measurements; five are scored."""
+each_lag = pytest.mark.parametrize("name", [PIPE, LAGGED, SMOOTHING])
 
 
 def make(name=PIPE, num_envs=3, mode="vector_entry_point", **kwargs):
@@ -68,7 +62,7 @@ def assert_same_play(one, other):
             assert_same_array(mine[k], theirs[k])
 
 
-@pytest.mark.parametrize(("name", "num_envs"), [(PIPE, 1), *((name, 5) for name in AT_HOME)])
+@pytest.mark.parametrize(("name", "num_envs"), [(PIPE, 1), *((name, 5) for name in KINDS)])
 def test_same_as_scalar_environments(name, num_envs):
     """Over three episodes, two of them after an autoreset, it equals gymnasium's SyncVectorEnv."""
     mine = make(name, num_envs)
@@ -97,7 +91,7 @@ def test_same_as_scalar_environments(name, num_envs):
     assert num_envs == 1 or seen > world.n_steps                             # other episodes
 
 
-@pytest.mark.parametrize("name", LAGS)
+@each_lag
 def test_later_resets_are_those_of_scalar_environments(name):
     """Resets with any sequence of seeds, partly None, during an episode or without a seed, are equal."""
     mine = make(name)
@@ -125,32 +119,7 @@ def test_images_are_those_of_scalar_environments():
         make(render_mode="rgb_array").render()
 
 
-def test_seed_names_the_episode():
-    """Environment k begins episode s + k, or the k-th of a list."""
-    envs = make()
-    for seed, episodes in ((4, [4, 5, 6]), ([8, 1, 8], [8, 1, 8])):
-        observation, _ = envs.reset(seed=seed)
-        for k, number in enumerate(episodes):
-            expected = simulate(TINY, number).voltages(1, TINY.currents[0], TINY)
-            np.testing.assert_allclose(observation["voltages"][k], expected, rtol=1e-12)
-            np.testing.assert_array_equal(observation["currents"][k], TINY.currents[0])
-
-
-def test_without_a_seed_training_episodes_are_drawn():
-    """All of the first ``episodes`` are drawn and no others, separately for each environment."""
-    envs = make(num_envs=4)
-    first = [simulate(TINY, number).voltages(1, TINY.currents[0], TINY) for number in range(3)]
-    drawn = []
-    for _ in range(12):
-        voltages = envs.reset()[0]["voltages"]
-        near = [[np.allclose(row, one, rtol=1e-12) for one in first] for row in voltages]
-        assert np.sum(near) == 4
-        drawn.append([row.index(True) for row in near])
-    assert {number for row in drawn for number in row} == {0, 1, 2}     # fails once in 10⁸ runs
-    assert len(set(zip(*drawn, strict=True))) > 1
-
-
-@pytest.mark.parametrize("name", LAGS)
+@each_lag
 def test_observations_are_fresh_and_within_their_space(name):
     """Writing to an observation does not change later ones."""
     envs = make(name)
@@ -173,7 +142,7 @@ def test_observations_are_fresh_and_within_their_space(name):
         assert_same_play([step], [expected])
 
 
-@pytest.mark.parametrize("name", LAGS)
+@each_lag
 def test_made_again_from_its_specification(name):
     """An environment can be made from its EnvSpec, from JSON, from the scalar environment's spec, or by pickle."""
     envs = make(name)
@@ -189,35 +158,23 @@ def test_made_again_from_its_specification(name):
         assert_same_play(play(again, actions, seed=1), played)
 
 
-@pytest.mark.parametrize("seed", [[], [1, 2], [1, 2, 3, 4], np.arange(2)])
-def test_wrong_number_of_seeds_is_named(seed):
-    """Seeds are one per environment or one integer; otherwise the present episode continues."""
+def test_invalid_resets_do_not_end_the_episode():
+    """Seeds are one per environment or one integer, and `reset` has no options; a step needs a reset."""
     envs = make()
     actions = actions_for(envs, 3)
-    played = play(envs, actions, seed=1)
-    envs.reset(seed=1)
-    message = rf"seed must be an integer or a list of 3, got {len(seed)} entries"
-    with pytest.raises(ValueError, match=message):
-        envs.reset(seed=seed)
-    assert_same_play([envs.step(action) for action in actions], played[1:])
-
-
-def test_reset_of_some_is_refused():
-    """All environments begin and end together, and `reset` has no options."""
-    envs = make()
-    actions = actions_for(envs, 2)
+    with pytest.raises(gym.error.ResetNeeded, match=r"call reset\(\) before step\(\)"):
+        envs.step(actions[0])
     played = play(envs, actions, seed=1, options={})
+    envs.reset(seed=1)
+    for seed in ([], [1, 2], [1, 2, 3, 4], np.arange(2)):
+        with pytest.raises(ValueError, match=f"seed must be an integer or a list of 3, got {len(seed)} entries"):
+            envs.reset(seed=seed)
+    for seed in (1.5, True, [1.7, 2, 3], [True, False, True], np.array([1.5, 2.0, 3.0]), "ab"):
+        with pytest.raises(ValueError, match="seed must be"):                             # as in one environment
+            envs.reset(seed=seed)
     with pytest.raises(ValueError, match="options must be None or empty"):
         envs.reset(options={"reset_mask": np.array([True, False, True])})
-    envs.reset(seed=1)
     assert_same_play([envs.step(action) for action in actions], played[1:])
-
-
-def test_step_needs_a_reset():
-    """A step before the first reset is rejected."""
-    envs = make()
-    with pytest.raises(gym.error.ResetNeeded, match=r"call reset\(\) before step\(\)"):
-        envs.step(actions_for(envs, 1)[0])
 
 
 BAD = np.full((3, 1701), 30.0)
@@ -246,26 +203,17 @@ def test_wrong_actions_are_named_and_change_nothing(action, message):
     assert_same_play(steps, played[1:])
 
 
-@pytest.mark.parametrize("kind", ["float32", "list", "Fortran", "read-only"])
-def test_actions_of_any_kind_of_number_count(kind):
+def test_actions_of_any_kind_of_number_count():
     """Single precision, lists and any memory layout are accepted as estimates."""
     envs = make()
     drawn = np.random.default_rng(5).uniform(20.0, 40.0, (3, 1701))
     estimates = drawn.astype(np.float32).astype(float)
-    given = {"float32": estimates.astype(np.float32), "list": estimates.tolist(),
-             "Fortran": np.asfortranarray(estimates), "read-only": estimates.copy()}[kind]
-    if kind == "read-only":
-        given.setflags(write=False)
-    plain, same = (play(envs, [action] * 7, seed=1) for action in (estimates, given))
-    assert_same_play(same, plain)
+    read_only = estimates.copy()
+    read_only.setflags(write=False)
+    plain = play(envs, [estimates] * 5, seed=1)
     assert plain[-1][1].all()
-
-
-@pytest.mark.parametrize("seed", [1.5, True, [1.7, 2, 3], [True, False, True], np.array([1.5, 2.0, 3.0]), "ab"])
-def test_seeds_that_would_be_cast_are_refused(seed):
-    """Invalid seeds are rejected as in the scalar environment."""
-    with pytest.raises(ValueError, match="seed must be"):
-        make().reset(seed=seed)
+    for given in (estimates.astype(np.float32), estimates.tolist(), np.asfortranarray(estimates), read_only):
+        assert_same_play(play(envs, [given] * 5, seed=1), plain)
 
 
 @pytest.mark.parametrize("change", [{"num_envs": 0}, {"episodes": 0}, {"lag": 99}, {"lag": "x"}])

@@ -95,8 +95,8 @@ def test_what_the_readme_shows_works(installed, empty):
     """All Python blocks run, with a short training of the agent, and the records load as a table."""
     readme = (ROOT / "README.md").read_text()
     shown = "\n".join(re.findall(r"```python\n(.*?)```", readme, re.DOTALL))
-    assert "learn(100_000)" in shown
-    installed("-c", shown.replace("learn(100_000)", "learn(2048)"), cwd=empty)
+    assert "env).learn(100_000)" in shown
+    installed("-c", shown.replace("env).learn(100_000)", "env, n_steps=64).learn(64)"), cwd=empty)
     said = installed("-c", "import eitbench; print(len(eitbench.leaderboard.load()))", cwd=empty)
     assert int(said) > 10_000
 

@@ -123,9 +123,9 @@ def test_run_shows_the_withheld_rmse(folder):
 def submitted(folder):
     """Records of a naive baseline and of a third-party method."""
     method_file = write_baseline(folder, "mine", update="return Estimate(1.1 * self.level)")
-    for method in ("homogeneous", method_file):
+    for method, *seeds in (("homogeneous",), (method_file, "--seeds", "test:0")):
         code, _, err = eitbench("submit", "--env", ID, "--baseline", method, "--to", folder / "results",
-                                "--out", folder / "store", "--jobs", 1)
+                                "--out", folder / "store", "--jobs", 1, *seeds)
         assert code == 0, err
     return folder / "results"
 

@@ -27,12 +27,14 @@ def test_ktc(tmp_path):
 
 
 def test_kit4(tmp_path):
-    """Each column has the voltages of an injection."""
-    savemat(tmp_path / "datamat_2_1.mat", {
-        "CurrentPattern": 1e3 * CURRENTS.T, "MeasPattern": MATRIX[:5].T, "Uel": VALUES[:, :5].T})
+    """Each column has the voltages of an injection; the reference is the file of the empty tank."""
+    patterns = {"CurrentPattern": 1e3 * CURRENTS.T, "MeasPattern": MATRIX[:5].T}
+    savemat(tmp_path / "datamat_2_1.mat", patterns | {"Uel": VALUES[:, :5].T})
     measurements = read(tmp_path / "datamat_2_1.mat")
     np.testing.assert_array_equal(measurements.voltages, VALUES[:, :5])
     assert measurements.reference is None
+    savemat(tmp_path / "datamat_1_0.mat", patterns | {"Uel": 2 * VALUES[:, :5].T})
+    np.testing.assert_array_equal(read(tmp_path / "datamat_2_1.mat").reference, 2 * VALUES[None, :, :5])
 
 
 def test_eidors(tmp_path):

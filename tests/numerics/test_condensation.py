@@ -1,7 +1,4 @@
-"""Sparse systems condensed onto their last unknowns, against dense inverses.
-
-The tests also run on the reference implementation in tests/references.py.
-"""
+"""Sparse systems condensed onto their last unknowns, against dense inverses."""
 
 import pickle
 import sys
@@ -13,10 +10,6 @@ import scipy.sparse as sp
 from eitbench.numerics import condensation
 from eitbench.numerics.condensation import Condensation
 from numpy.testing import assert_allclose, assert_array_equal
-
-from references import SuperLUCondensation
-
-both = pytest.mark.parametrize("kind", [Condensation, SuperLUCondensation])
 
 
 def random_pattern(n: int, n_ports: int, seed: int) -> sp.csc_array:
@@ -47,16 +40,11 @@ def random_matrices(pattern: sp.csc_array, count: int, seed: int) -> list[np.nda
     return matrices
 
 
-CASES = pytest.mark.parametrize(("n", "n_ports"),
-                                [(5, 1), (30, 3), (180, 7), (400, 15), (400, 17)])
-
-
-@both
-@CASES
-def test_dense_inverse(kind, n, n_ports):
+@pytest.mark.parametrize(("n", "n_ports"), [(5, 1), (30, 3), (180, 7), (400, 15), (400, 17)])
+def test_dense_inverse(n, n_ports):
     """The ports' block and columns of K⁻¹ equal the dense inverse, for one matrix and for many."""
     pattern = random_pattern(n, n_ports, seed=n)
-    system = kind(pattern, n_ports)
+    system = Condensation(pattern, n_ports)
     matrices = random_matrices(pattern, 11, seed=n + 1)
     values = np.stack([K[system.rows, system.columns] for K in matrices], axis=1)
     exact = np.linalg.inv(np.array(matrices))
@@ -81,12 +69,11 @@ def box_pattern(shape, n_ports):
     return sp.csc_array(full), places
 
 
-@both
 @pytest.mark.parametrize("shape", [(4, 4, 30), (9, 9, 9), (1, 1, 5)])
-def test_nested_dissection(kind, shape):
+def test_nested_dissection(shape):
     """Block and columns equal the dense inverse also with nested dissection."""
     pattern, places = box_pattern(shape, 2)
-    system = kind(pattern, 2, places)
+    system = Condensation(pattern, 2, places)
     (matrix,) = random_matrices(pattern, 1, seed=1)
     exact = np.linalg.inv(matrix)
     values = matrix[system.rows, system.columns]
@@ -107,11 +94,10 @@ def test_wide_fronts_are_taken_one_by_one(monkeypatch):
     assert_allclose(alone.port_inverse(values), together, rtol=1e-12, atol=0)
 
 
-@both
-def test_entries_are_complete(kind):
+def test_entries_are_complete():
     """The requested entries form the pattern: at least one triangle, no duplicates, no other entries."""
     pattern = random_pattern(120, 5, seed=3)
-    system = kind(pattern, 5)
+    system = Condensation(pattern, 5)
     entries = (np.ones(len(system.rows)), (system.rows, system.columns))
     asked = sp.coo_array(entries, shape=pattern.shape).toarray()
     assert asked.max() == 1.0

@@ -60,15 +60,14 @@ def gradients_at_middles(flow):
     return np.einsum("cmib,cia->cmab", np.concatenate([at_nodes, at_edges], axis=2), flow.cell_velocity)
 
 
-def cavity(cells, viscosity, grading=1.5, turn=0.0, lid_last=False):
-    """Return the flow in the unit square under a lid of unit speed, rotated by an angle about its corner."""
-    line = graded_interval(0.0, 1.0, cells, grading)
+def cavity(cells, viscosity, lid_last=False):
+    """Return the flow in the unit square under a lid of unit speed."""
+    line = graded_interval(0.0, 1.0, cells, 1.5)
     square = rectangle_mesh(line, line)
     lid = side(square, 1, 1.0)
     rest = np.array([facet for facet in square.boundary_facets.tolist() if facet not in lid.tolist()])
-    axes = np.array([[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]])
-    walls = [(lid, uniform(*axes[0])), (rest, AT_REST)]
-    return steady_flow(Mesh(square.points @ axes, square.cells), viscosity, walls[::-1] if lid_last else walls)
+    walls = [(lid, uniform(1.0, 0.0)), (rest, AT_REST)]
+    return steady_flow(square, viscosity, walls[::-1] if lid_last else walls)
 
 
 # -- against exact solutions ------------------------------------------------------------------------------------------
@@ -163,14 +162,6 @@ def test_cavity_at_reynolds_1000():
     assert_allclose(v, [0.29012, 0.37095, 0.02526, -0.51550], atol=0.012)
     assert_allclose(u, [-0.3004561, -0.3885691, -0.2803696, -0.0620561, 0.1886747, 0.4723329], atol=0.0012)
     assert_allclose(v, [0.2962703, 0.3769189, 0.0257995, -0.5264392], atol=0.0012)
-
-
-def test_turning_the_cavity_turns_the_flow():
-    """For mesh and lid rotated by 35°, velocity and pressure are rotated."""
-    straight, turned = cavity(8, 1e-2), cavity(8, 1e-2, turn=0.61)
-    axes = np.array([[np.cos(0.61), np.sin(0.61)], [-np.sin(0.61), np.cos(0.61)]])
-    assert_allclose(turned.cell_velocity, straight.cell_velocity @ axes, atol=1e-10)
-    assert_allclose(turned.pressure, straight.pressure, atol=1e-10)
 
 
 def test_shared_nodes_take_the_last_value():

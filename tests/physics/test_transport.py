@@ -7,7 +7,7 @@ import pytest
 import scipy.linalg
 from eitbench.numerics.compiled import scratch
 from eitbench.numerics.fem import mass_matrix
-from eitbench.numerics.mesh import Mesh, rectangle_mesh
+from eitbench.numerics.mesh import rectangle_mesh
 from eitbench.physics.flow import PlaneChannelFlow
 from eitbench.physics.transport import MIN_WIDE_COLUMNS, ConvectionDiffusion, _supg_matrices, inlet_nodes
 
@@ -109,26 +109,6 @@ def test_linear_profile_is_carried_exactly(cells):
     cd = ConvectionDiffusion(box_mesh(np.ones(len(cells)), cells), uniform(*velocity), 1e-14, 0.1, substeps=3)
     error = follow(cd, lambda points, time: 5.0 + (points - velocity * time) @ slope, steps=4)
     assert error < 1e-12
-
-
-def test_shear_disperses_as_taylor_and_aris_say():
-    """After a²/D the section's mean slug spreads with D·[1 + (2/105)(v̄a/D)²], here 2.9 D; measured 1.003 of it."""
-    a, mean, D = 1.0, 1.0, 0.1
-    # The slug is symmetric about the axis, where ∂c/∂n = 0: half the channel will do.
-    mesh = rectangle_mesh(np.linspace(0.0, 24.0, 257), np.linspace(0.0, a, 17))
-    cd = ConvectionDiffusion(mesh, PlaneChannelFlow(mean, a), D, 0.5, substeps=16)
-    x, weights = mesh.points[:, 0], mass_matrix(mesh).sum(axis=0)
-    c = np.exp(-0.5 * (x - 5.0)**2)
-    start = weights @ c
-    variance = []
-    for _ in range(14):
-        c = cd.step(c, 0.0, 0.0)
-        mass = weights * c / (weights @ c)
-        variance.append(mass @ (x - mass @ x)**2)
-    assert weights @ c == pytest.approx(start, rel=1e-5)                                # the slug is completely inside
-    # Transverse modes decay as exp(−π²Dt/a²): after t = 5 less than 1 % of them is left.
-    effective = (variance[-1] - variance[9]) / (2 * 4 * cd.time_step)
-    assert effective == pytest.approx(D * (1 + 2 / 105 * (mean * a / D)**2), rel=0.01)
 
 
 # -- balances ---------------------------------------------------------------------------------------------------------
@@ -322,17 +302,6 @@ def test_fluid_enters_where_it_points_inwards():
     np.testing.assert_array_equal(inlet_nodes(mesh, uniform(0.0, -1.0)), np.flatnonzero(y == 1))
     np.testing.assert_array_equal(inlet_nodes(mesh, uniform(2.0, 1.0)), np.flatnonzero((x == 0) | (y == 0)))
     assert inlet_nodes(mesh, uniform(0.0, 0.0)).size == 0
-
-
-def test_turning_the_channel_changes_nothing():
-    """Mesh and velocity rotated by 35° have the same inlet nodes and the same step."""
-    straight, flow, rng = channel(), PlaneChannelFlow(1.0, 0.25), np.random.default_rng(5)
-    turn = np.array([[np.cos(0.61), np.sin(0.61)], [-np.sin(0.61), np.cos(0.61)]])
-    turned = ConvectionDiffusion(Mesh(straight.mesh.points @ turn, straight.mesh.cells),
-                                 lambda points: flow(points @ turn.T) @ turn, 4e-3, 0.2, substeps=4)
-    np.testing.assert_array_equal(turned.inlet, straight.inlet)
-    c = rng.normal(size=91)
-    np.testing.assert_allclose(turned.step(c, 1.0, 2.0), straight.step(c, 1.0, 2.0), atol=1e-12)
 
 
 def test_cube_of_tetrahedra():

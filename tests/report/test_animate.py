@@ -6,12 +6,12 @@ import pytest
 from eitbench.envs.rendering import draw_comparison
 from eitbench.report.animate import animate
 
-from tiny import SCENARIO
+from short import FAST
 
 
 def test_each_field_has_a_panel_of_its_own():
     """Panels are below each other in one colour scale: equal estimates have equal pixels, different ones have not."""
-    env = gym.make("eitbench/Pipe2D-v0", world=SCENARIO).unwrapped
+    env = gym.make("eitbench/Pipe2D-v0", world=FAST).unwrapped
     task = env.task
     low, high = (np.full(task.mesh.n_nodes, factor * task.expected_concentration) for factor in (0.6, 1.8))
     fields = [(name, task.mesh, values) for name, values in (("Truth", high), ("A", low), ("B", high))]

@@ -22,7 +22,7 @@ from pages import Page, svgs
 from PIL import Image
 
 from short import short, shorten
-from tiny import FILTER, SCENARIO, SMOOTHING, git_says, record, write_baseline
+from tiny import FILTER, SMOOTHING, git_says, record, write_baseline
 
 EVIL = "Evil <script>alert('x')</script> & \\\"co\\\""
 """A title with HTML; the page must escape it."""
@@ -36,8 +36,7 @@ def made(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv(CACHE_VARIABLE, str(folder / "cache"))
         git_says(patch)
-        for name in (FILTER.id, SMOOTHING.id):
-            shorten(patch, {name: SCENARIO})
+        shorten(patch, FILTER.id, SMOOTHING.id)
         evil = write_baseline(folder, "evil", doc=EVIL + ": bad.", update="return Estimate(self.level + self.calls)")
         failing = write_baseline(folder, "surely_failing", doc="Failing", update="raise RuntimeError('<b>&lt;')")
         store = EpisodeStore(folder)

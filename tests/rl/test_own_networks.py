@@ -16,11 +16,11 @@ from eitbench.rl import save_agent
 from sb3_contrib import TRPO
 from stable_baselines3 import PPO
 
-from short import PIPE, shorten
+from short import shorten, world
 from tiny import git_says
 
 NAME, FILTER = "eitbench/Pipe2DInjection-v0", "eitbench/Pipe2D-v0"
-SHORT = {"world": PIPE}
+SHORT = world(NAME)
 POLICY = '''"""A network in the style of CleanRL."""
 from pathlib import Path
 
@@ -65,7 +65,7 @@ class Estimator:
 def short_episodes(monkeypatch, tmp_path):
     """Make the episodes of the registered environments short, and submit from a clean commit."""
     git_says(monkeypatch, "c0ffee")
-    shorten(monkeypatch, {FILTER: PIPE, NAME: PIPE})
+    shorten(monkeypatch, FILTER, NAME)
     monkeypatch.chdir(tmp_path)
 
 

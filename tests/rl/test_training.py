@@ -20,12 +20,12 @@ from threadpoolctl import threadpool_limits
 
 from commands import eitbench
 from injection_envs import injected
-from short import PIPE, merged, shorten
+from short import merged, shorten, world
 
 NAME = "eitbench/Pipe2DInjection-v0"
 CURRENTS, BUDGET = "eitbench/Pipe2DInjectionCurrents-v0", "eitbench/Pipe2DInjectionBudget-v0"
-SHORT = {"world": {"flow": {"mean_velocity": 16.0}, "schedule": {"scored_steps": 4}}}
-"""An episode with four steps of the agent."""
+SHORT = world(NAME)
+"""An episode with six steps of the agent."""
 TINY = TrainingConfig(total_steps=32, n_envs=2, interval=16, evaluation_episodes=2, episodes=3, hidden=(8,),
               algorithm={"n_steps": 8, "batch_size": 8})
 RUNS = {"ppo": (NAME, {"n_steps": 8, "batch_size": 8}), "maskable_ppo": (BUDGET, {"n_steps": 8, "batch_size": 8}),
@@ -62,13 +62,13 @@ def test_sb3_receives_the_observations_of_the_environments():
     assert ours.get_attr("action_space") == [env.action_space for env in single]
     assert ours.get_attr("observation_space", [1]) == [single[1].observation_space]
     rng = np.random.default_rng(0)
-    for step in range(1, 6):
+    for step in range(1, 8):
         actions = rng.integers(120, size=3)
         shown, rewards, ended, infos = ours.step(actions)
         outcome = [env.step(int(action)) for env, action in zip(single, actions, strict=True)]
         np.testing.assert_allclose(rewards, [10.0 * each[1] for each in outcome], rtol=1e-6)
-        assert ended.all() == (step == 4) == outcome[0][2]
-        if step == 4:
+        assert ended.all() == (step == 6) == outcome[0][2]
+        if step == 6:
             np.testing.assert_array_equal([info["terminal_observation"] for info in infos], [e[0] for e in outcome])
             np.testing.assert_array_equal(shown, [env.reset()[0] for env in single])
         else:
@@ -177,7 +177,7 @@ def test_failed_estimates_are_in_evaluations(monkeypatch):
         def predict(self, *_, **__):
             return np.zeros(2, dtype=int), None
 
-    errors, factors = InjectionVectorEnv.errors, iter([[1, 1], [1, 1], [1, 1], [1, np.nan]])
+    errors, factors = InjectionVectorEnv.errors, iter([*[[1, 1]] * 5, [1, np.nan]])
     monkeypatch.setattr(InjectionVectorEnv, "errors", lambda self: errors(self) * next(factors))
     assert list(np.isnan(training.make_evaluator(NAME, SHORT, TINY)(Still())[0])) == [False, True]
 
@@ -236,9 +236,9 @@ def test_rewards_of_a_reference_are_subtracted(tmp_path):
     ours.reset()
     rng, best = np.random.default_rng(0), world.rules.pairs.tolist().index([0, 8])
     for _ in range(2):
-        started, actions = list(envs.seeds), rng.integers(120, size=(4, 3))
+        started, actions = list(envs.seeds), rng.integers(120, size=(6, 3))
         earned = []
-        for chosen in (actions, np.full((4, 3), best)):
+        for chosen in (actions, np.full((6, 3), best)):
             plain.reset(seed=started)
             earned.append([plain.step(action)[1] for action in chosen])
         expected = 10.0 * np.subtract(*earned)
@@ -249,7 +249,7 @@ def test_rewards_of_a_reference_are_subtracted(tmp_path):
 
 def test_the_command_prints_the_score_and_the_next_command(monkeypatch, tmp_path):
     """The score is the mean error in the dev episodes of the last evaluation."""
-    shorten(monkeypatch, {NAME: PIPE})
+    shorten(monkeypatch, NAME)
     config = tmp_path / "config.yml"
     config.write_text("total_steps: 16\nn_envs: 2\ninterval: 16\nevaluation_episodes: 2\nepisodes: 2\nhidden: [8]\n"
                       "algorithm: {n_steps: 8, batch_size: 8}\n")

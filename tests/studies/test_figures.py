@@ -21,9 +21,7 @@ from eitbench.worlds.task import Estimate
 from matplotlib.image import imread
 from PIL import Image
 
-from injection_envs import SHORT
-from short import merged, shorten
-from tiny_worlds import CHANGES
+from short import FAST, merged, shorten
 
 sys.path.append(str(Path(__file__).parents[2] / "studies"))
 FIGURES = importlib.import_module("thesis").FIGURES
@@ -32,7 +30,7 @@ common, injection, obstacle, parameters, pipe2d, profiles, tanks, velocity = (
     ("common", "injection", "obstacle", "parameters", "pipe2d", "profiles", "tanks", "velocity"))
 episode_error, run_baseline = common.episode_error, common.run_baseline
 SEED = 100_000
-PIPE = merged(CHANGES, {"schedule": {"scored_steps": 32}})
+PIPE = merged(FAST, {"schedule": {"scored_steps": 32}})
 """A fast fluid crosses the pipe in two steps; pictures of the pipe show states up to the 28th."""
 FLOW = merged(PIPE, {"flow": {"velocity_range": [55.0, 60.0], "velocity_std": 10.0}})
 OBSTACLE = merged(PIPE, {"flow": {"viscosity": 2e-2}})
@@ -195,7 +193,7 @@ def test_injection_is_drawn(monkeypatch, run_cache, tmp_path):
                                                             for job in jobs)))}))
     monkeypatch.setattr(injection, "policy_rows", rows)
     monkeypatch.setattr(injection, "folder_results", lambda folder: [])
-    shorten(monkeypatch, {injection.ANIMATED[0]: SHORT})
+    shorten(monkeypatch, injection.ANIMATED[0])
     monkeypatch.setenv(CACHE_VARIABLE, run_cache)           # has the reduced model of other tests
     path, description = FIGURES["injection"](None, 1, tmp_path / "new")
     picture = imread(path)
@@ -203,7 +201,7 @@ def test_injection_is_drawn(monkeypatch, run_cache, tmp_path):
     assert list(run_seeds.items()) == [((env, "{}"), entry(env).test_seeds) for env in injection.WORLDS]
     assert description.count("best_pair ") == 6
     with Image.open(tmp_path / "new" / "injection.gif") as animation:
-        assert animation.n_frames == 4                        # the first frame of 16, then four steps
+        assert animation.n_frames == 6                        # the first frame of 16, then six steps
 
 
 def test_thesis_figures_show_dev_episodes_by_default(monkeypatch, tmp_path):

@@ -9,8 +9,8 @@ from eitbench.worlds.catalogue import PIPE_2D_BIASED, PIPE_2D_SKEWED, PIPE_2D_TI
 from eitbench.worlds.random_streams import episode_streams
 from scipy.stats import kstest
 
-from short import merged
-from tiny_worlds import CHANGES, FAST, TINY
+from short import DRAWN, FAST, merged
+from tiny_worlds import TINY
 
 WORLDS = (PIPE_2D_BIASED, PIPE_2D_UNKNOWN, PIPE_2D_TIME_VARYING, PIPE_2D_SKEWED)
 each_world = pytest.mark.parametrize("world", WORLDS, ids=lambda world: world.name)
@@ -86,7 +86,7 @@ def test_skewness_has_either_sign():
 def test_known_velocity_makes_the_episode_of_the_plain_pipe():
     """Without randomness, and with the same spin-up, it equals `PIPE_2D`, with its inflow and noise, to rounding."""
     def of(velocity):
-        return PIPE_2D_BIASED.with_changes(merged(CHANGES, {"flow": {"velocity_range": [velocity] * 2}}))
+        return PIPE_2D_BIASED.with_changes(merged(FAST, {"flow": {"velocity_range": [velocity] * 2}}))
 
     world = of(45.0)
     assert world.spin_up_steps == TINY.spin_up_steps
@@ -114,7 +114,7 @@ def test_slowest_fluid_flushes_the_pipe_before_the_start():
 @each_unknown
 def test_recorded_flow_is_the_drawn_one(world):
     """`Episode.velocity` is the profile at `VelocityModel.points` in the middle of each step, with the drawn mean."""
-    world = world.with_changes(FAST)
+    world = world.with_changes(DRAWN)
     velocity = simulate(world, 7, cache=False).velocity
     model = world.velocity_model
     assert velocity.shape == (5, 24)
@@ -132,7 +132,7 @@ def test_recorded_flow_is_the_drawn_one(world):
 
 def test_recorded_flow_is_the_one_that_carries():
     """The truth's two transport steps with the cached mean velocity give the next cached state to rounding."""
-    world = PIPE_2D_TIME_VARYING.with_changes(FAST)
+    world = PIPE_2D_TIME_VARYING.with_changes(DRAWN)
     half_width = world.vessel.half_width
     truth = cached_truth_model(world)
     (history,) = world.evolve([episode_streams(7)], truth, lambda _: None)
@@ -152,7 +152,7 @@ def test_recorded_flow_is_the_one_that_carries():
 @each_world
 def test_a_reference_is_given_the_flow_that_carries(world):
     """The true transport is bit-identical to a step on the estimator mesh with the flow drawn for that step."""
-    world = world.with_changes(FAST)
+    world = world.with_changes(DRAWN)
     model, flow = world.estimator_model(), drawn(world, 7)
     transport_at = world.true_transport(model, episode_streams(7).flow)
     c = 30.0 + np.random.default_rng(0).normal(size=model.transport.mesh.n_nodes)
@@ -163,7 +163,7 @@ def test_a_reference_is_given_the_flow_that_carries(world):
 
 def test_simulated_together_same_bits():
     """Episodes with different flows are simulated one by one, with the same results as alone."""
-    world = PIPE_2D_TIME_VARYING.with_changes(FAST)
+    world = PIPE_2D_TIME_VARYING.with_changes(DRAWN)
     together = list(episodes.simulate_batch(world, [8, 7], progress=False))
     alone = [simulate(world, seed, cache=False) for seed in (8, 7)]
     for one, other in zip(together, alone, strict=True):
