@@ -83,7 +83,7 @@ def _row(asked: Environment, runner: Method | Job, seed: int) -> dict[str, Any]:
         error.add_note(f"{method.name} on {asked.id}, {format_seed(seed)}")
         raise
     name = qualified_name({"id": asked.id, "name": asked.name})
-    row = {"environment": name, "method": method.name, "seed": format_seed(seed)}
+    row: dict[str, Any] = {"environment": name, "method": method.name, "seed": format_seed(seed)}
     if run.episode_return is not None:
         row["return"] = run.episode_return
     return row | compute_scores(method.track, run.outcome)

@@ -348,8 +348,8 @@ class _Checkpoints(BaseCallback):
         """Append errors and returns (episodes,) to the table, and remove rows of the same or a
         larger number of steps, which belong to lost checkpoints."""
         errors, returns, lengths = self.evaluator(model)
-        row = {"timesteps": model.num_timesteps, "results": returns, "ep_lengths": lengths,
-               "errors": errors}
+        row: dict[str, Any] = {"timesteps": model.num_timesteps, "results": returns,
+                               "ep_lengths": lengths, "errors": errors}
         path = self.folder / "evaluations.npz"
         table = {name: np.zeros((0, *np.shape(value)), int if name == "timesteps" else float)
                  for name, value in row.items()}
@@ -357,7 +357,8 @@ class _Checkpoints(BaseCallback):
             table = dict(np.load(path))
         kept = table["timesteps"] < model.num_timesteps
         content = io.BytesIO()
-        np.savez(content, **{name: np.concatenate([table[name][kept], np.array([value])])
-                             for name, value in row.items()})
+        rows: dict[str, Any] = {name: np.concatenate([table[name][kept], np.array([value])])
+                                for name, value in row.items()}
+        np.savez(content, **rows)
         write_atomically(path, content.getvalue())
         return errors, returns
