@@ -210,7 +210,7 @@ class LowRankCovariance(Covariance):
     """Covariance P_t = s Π_t − Z Zᵀ: few measurements of a large state, without n×n products.
 
     Measurements add columns to Z (n, r), which is propagated by F and truncated to its numerical
-    rank, far below n (``docs/methods.md``, 5). F and Q are those of the open-loop covariance.
+    rank, far below n (``docs/methods.md``, 5). F and Q belong to the open-loop covariance.
 
     Parameters
     ----------

@@ -42,7 +42,7 @@ def adaptivity_gap(rows: pd.DataFrame, open_loop: Sequence[str] = OPEN_LOOP,
     of its 95 % bootstrap interval over the episodes, infinite where there are too few.
 
     ``rows`` have the columns policy, seed and error. ``ValueError`` unless they hold clairvoyant,
-    random_pair and some of ``open_loop``, of which the best counts, all on the same episodes.
+    random_pair and some of ``open_loop`` on the same episodes; the best of them counts.
     """
     errors = errors_by_policy(rows)
     blind = [name for name in open_loop if name in errors]
