@@ -57,8 +57,8 @@ def golden_methods() -> dict[str, str]:
     """Map the name of each method's golden file to the method: a name, or an agent's path."""
     agents = {methods.golden_name(Path(path)): path
               for id in tracks.ids("injection") for path in reversed(methods.builtin_agents(id))}
-    names = [name for track in tracks.TRACKS for name in methods.builtin_methods(track)]
-    return dict(zip(names, names, strict=True)) | agents
+    return {name: name for track in tracks.TRACKS
+            for name in methods.builtin_methods(track)} | agents
 
 
 def golden_path(name: str) -> Path:

@@ -601,11 +601,10 @@ def _copy_kernels() -> None:
 class _MethodServer:
     """Requests that a worker answers; each method returns the content of a reply."""
 
-    def __init__(self) -> None:
-        self._file = Path()
-        self._method: Any = None
-        self._known: Any = None
-        self._instance: Any = None
+    _file = Path()
+    _method: Any
+    _known: Any
+    _instance: Any
 
     def load(self, track: str, id: str, kwargs: dict[str, Any], method: str, entry: np.ndarray,
              **files: np.ndarray) -> dict[str, Any]:

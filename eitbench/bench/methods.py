@@ -69,7 +69,8 @@ class Method(NamedTuple):
     name: str
     """Name of the file without its suffix; for an agent, algorithm and training seed."""
     title: str
-    """First line of its docstring, up to a colon, bracket or full stop."""
+    """First line of its docstring, up to a colon, bracket or full stop, and at most
+    `MAX_TITLE_CHARS` characters; without a docstring the file's name."""
     path: Path
     sha256: str
     subtracks: tuple[str, ...]
@@ -305,8 +306,10 @@ def _load(path: Path, source: bytes, sha256: str, track: str) -> Method:
     if not isinstance(method, type):
         raise ValueError(f"{form.kind} {path} must define a class {form.type} with a method "
                          f"{form.interface}")
+    paragraph = " ".join((module.__doc__ or "").strip().split("\n\n")[0].split())
+    title = re.split(r"[.:](?:\s|$)", paragraph)[0][:MAX_TITLE_CHARS].strip() or path.stem
     return method_from_class(method, track, path.stem, str(path))._replace(
-        title=title_of(module, path), path=path, sha256=sha256)
+        title=title, path=path, sha256=sha256)
 
 
 def method_from_class(method: type[Any], track: str, name: str, where: str = "") -> Method:
@@ -349,11 +352,3 @@ def load_module(kind: str, path: Path, source: bytes) -> ModuleType:
         raise ValueError(f"{kind} {path} cannot be loaded: {type(error).__name__}: {error}{where}"
                          ) from error
     return module
-
-
-def title_of(module: ModuleType, path: Path) -> str:
-    """Return the docstring up to a colon or the end of the first sentence, and at most
-    `MAX_TITLE_CHARS` characters; without a docstring the file's name."""
-    paragraph = " ".join((module.__doc__ or "").strip().split("\n\n")[0].split())
-    title = re.split(r"[.:](?:\s|$)", paragraph)[0]
-    return title[:MAX_TITLE_CHARS].strip() or path.stem

@@ -8,7 +8,7 @@ from collections.abc import Iterable, Iterator
 import numpy as np
 
 from eitbench.bench.tracks import builtin_ids
-from eitbench.data.cache import PACKAGE_DATA, Arrays, File, load_shipped, ship
+from eitbench.data.cache import Arrays, File, load_shipped, ship
 from eitbench.data.episode_cache import csr_of, prefix_file, region_file, scoring_constants_file
 from eitbench.estimation.onboard.models import build_packed_model, reduced_model_key, unpack_model
 from eitbench.worlds.registry import Entry, entries, entry
@@ -57,12 +57,6 @@ def write_package_data(ids: Iterable[str] = ()) -> Iterator[tuple[str, str]]:
             yield file.key.name, "new"
         else:
             yield file.key.name, difference(load_shipped(file.key), built) or "same"
-
-
-def unused_files() -> list[str]:
-    """Return the names of shipped files that no built-in id needs."""
-    needed = {file.key.shipped_path.name for file in expected_files(builtin_ids())}
-    return sorted(path.name for path in PACKAGE_DATA.iterdir() if path.name not in needed)
 
 
 def difference(shipped: Arrays | None, built: Arrays) -> str:

@@ -163,7 +163,7 @@ def run_jobs(jobs: list[Job], store: EpisodeStore, *, n_jobs: int = 1, backend: 
 
 
 def successful_results(jobs: Iterable[Job],
-               results: Iterable[dict[str, Any]]) -> dict[Job, dict[str, Any]]:
+                       results: Iterable[dict[str, Any]]) -> dict[Job, dict[str, Any]]:
     """Map jobs to their first successful result, with the same environment, method, version and
     seed, from any commit; jobs without such a result are missing."""
     first: dict[tuple[str, ...], dict[str, Any]] = {}

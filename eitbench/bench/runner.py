@@ -263,7 +263,7 @@ def policy_generator(seed: int) -> np.random.Generator:
 
 
 def iter_estimates(env: EstimationEnv, estimator: Method,
-              seed: int) -> Iterator[tuple[int, Estimate]]:
+                   seed: int) -> Iterator[tuple[int, Estimate]]:
     """Yield (t, estimate of the state t ≥ 1) in one episode. The estimator receives the task and
     the measurements, but neither rewards nor the environment."""
     for t, estimate, _, _ in _iter_steps(env, estimator, seed):

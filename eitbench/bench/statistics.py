@@ -150,7 +150,7 @@ def paired_probability_of_improvement(a: Scores, b: Scores, *, higher_is_better:
 
 
 def resample(strata: Sequence[np.ndarray], statistic: Statistic, n_resamples: int,
-              seed: int) -> np.ndarray:
+             seed: int) -> np.ndarray:
     """Compute a statistic (n_resamples,) of resamples of the strata (n_e,)."""
     if n_resamples < 1:
         raise ValueError(f"n_resamples must be at least 1, got {n_resamples}")

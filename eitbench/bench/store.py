@@ -129,7 +129,9 @@ class EpisodeStore:
         own, others = _by_record(self.results()), _by_record(also)
         records = []
         for key in dict.fromkeys([*own, *others]):
-            fresh = _of_latest_code(own.get(key, []))
+            fresh = own.get(key, [])
+            code = _code(_latest(fresh)) if fresh else ()
+            fresh = [result for result in fresh if _code(result) == code]
             version = _latest(fresh or others[key])["version"]
             known = [each for each in others.get(key, []) if each["version"] == version]
             records.append(_gathered([*fresh, *known]))
@@ -169,15 +171,10 @@ def _latest(results: list[dict[str, Any]]) -> dict[str, Any]:
     return max(results, key=lambda result: result["finished"])
 
 
-def _of_latest_code(results: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Select the results that have the method's file and the declared versions of the result that
-    finished last."""
-    def code(result: dict[str, Any]) -> tuple[Any, ...]:
-        versions = result["run"]["versions"]
-        return result["method_sha256"], *map(versions.get, declared_versions())
-
-    latest = code(_latest(results)) if results else None
-    return [result for result in results if code(result) == latest]
+def _code(result: dict[str, Any]) -> tuple[Any, ...]:
+    """Return the method's file and the declared versions."""
+    versions = result["run"]["versions"]
+    return result["method_sha256"], *map(versions.get, declared_versions())
 
 
 def _gathered(results: list[dict[str, Any]]) -> dict[str, Any]:

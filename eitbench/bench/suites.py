@@ -52,8 +52,11 @@ def make_jobs(track: str, environments: list[str], methods: list[str],
     fitting = set[str]()
     for id, changes in itertools.product(environments, worlds):
         tracks.check_track(id, track)
-        asked = Environment(id, json.dumps(given | ({"world": changes} if changes else {})))
-        env = _probe_environment(asked)
+        arguments = given | ({"world": changes} if changes else {})
+        asked = Environment(id, json.dumps(arguments))
+        # subtrack and rules are read with the filter of the shortest setup
+        fastest = {"estimator": "reduced"} if track == "injection" else {}
+        env = cached_environment(Environment(id, json.dumps(arguments | fastest)))
         board = tracks.subtrack_of(env)
         numbers = tracks.default_seeds(id, suite) if seeds is None else seeds
         names = dict[str, str]()
@@ -81,11 +84,3 @@ def isolated_job(environment: Environment, method: str, isolate: str,
     kind = choose_isolation(environment, method, isolate, strict=strict)
     path = installed_methods().get(method, Path(method))
     return Job(environment, str(path.absolute()) if is_path(str(path)) else method, 0, kind)
-
-
-def _probe_environment(asked: Environment) -> Any:
-    """Make the environment with the filter of the shortest setup, to read subtrack and rules."""
-    if asked.track == "injection":
-        kwargs = json.loads(asked.kwargs) | {"estimator": "reduced"}
-        asked = asked._replace(kwargs=json.dumps(kwargs))
-    return cached_environment(asked)

@@ -190,8 +190,9 @@ def is_builtin_record(record: dict[str, Any], method: str) -> bool:
     """Return whether ``method``, from a record's `job_for_record`, is built in. A copy of a
     built-in agent's checkpoint counts as built in."""
     built_in = methods.builtin_files(record["environment"]["id"]).get(record["method"])
-    return is_builtin(method) or (built_in is not None and built_in.suffix == ".zip"
-                               and methods.builtin_sha256(built_in) == record["method_sha256"])
+    return is_builtin(method) or (
+        built_in is not None and built_in.suffix == ".zip"
+        and methods.builtin_sha256(built_in) == record["method_sha256"])
 
 
 # -- one episode --------------------------------------------------------------------------------
@@ -263,7 +264,7 @@ def replay_actions(record: dict[str, Any], recorded: dict[str, Any]) -> dict[str
     environment = Environment(record["environment"]["id"],
                               json.dumps(record["environment"]["kwargs"]))
     replay = methods.Method("injection", record["method"], record["title"], Path(), "",
-                    (record["board"],), {}, lambda *_: _Replay(actions))
+                            (record["board"],), {}, lambda *_: _Replay(actions))
     outcome = run_method(environment, replay, parse_seeds(recorded["seed"])[0]).outcome
     return {"status": "ok", "scores": compute_scores("injection", outcome),
             "step_errors": outcome.errors.tolist()}

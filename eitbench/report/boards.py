@@ -367,7 +367,7 @@ def error_and_skill(errors: dict[str, float], zero: dict[str, float]) -> dict[st
 
 
 def _with_interval(name: str, values: dict[str, dict[str, float]],
-               statistic: Any) -> dict[str, float | None]:
+                   statistic: Any) -> dict[str, float | None]:
     """Return a statistic of environment -> seed -> score, ``name``, and the ends of its 95 %
     interval, ``name_low`` and ``name_high``; None where unknown."""
     keys = (name, f"{name}_low", f"{name}_high")

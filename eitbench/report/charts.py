@@ -92,7 +92,7 @@ class Axis:
 
 
 def line_chart(x: np.ndarray, series: Sequence[Series], x_label: str, y_label: str, *,
-          log: bool = False) -> Markup:
+               log: bool = False) -> Markup:
     """Draw curves over a linear or logarithmic x axis and a logarithmic y axis; a series may end
     before ``x``, and NaN are left out."""
     values = np.concatenate([s.values for s in series])
@@ -149,7 +149,7 @@ def legend(series: Iterable[Series | ParetoPoint]) -> list[tuple[int, bool, str]
 
 
 def sparkline(three: tuple[float, float, float], px: Axis, *, mark: float | None = None,
-         each: Iterable[float] = ()) -> Markup:
+              each: Iterable[float] = ()) -> Markup:
     """Draw a dot and its interval for a table's cell, on the axis of its column, with a line at
     ``mark`` and a stroke for ``each`` value of a mean. Hidden from screen readers: the adjacent
     number has the same content."""

@@ -214,7 +214,7 @@ def states_at(env: Any, method: Any, seed: int, wanted: Collection[int],
 
 
 def _draw_panel(ax: Axes, task: Task, mesh: Mesh, values: np.ndarray, currents: np.ndarray, *,
-          colour_bar: bool = False) -> Any:
+                colour_bar: bool = False) -> Any:
     drawn = draw_field(ax, mesh, values, *colour_range(task))
     draw_electrodes(ax, task, currents, width=3.0)
     ax.set_xlabel("z / cm" if mesh.dim == 3 else "x / cm")

@@ -41,8 +41,8 @@ def adaptivity_gap(rows: pd.DataFrame, open_loop: Sequence[str] = OPEN_LOOP,
     """Return (best open-loop − clairvoyant) / (random − clairvoyant) of mean errors, with the ends
     of its 95 % bootstrap interval over the episodes, infinite where there are too few.
 
-    ``rows`` have the columns policy, seed and error. ``ValueError`` unless they hold clairvoyant,
-    random_pair and some of ``open_loop`` on the same episodes; the best of them counts.
+    ``rows`` have the columns policy, seed and error. The best of the policies ``open_loop`` counts.
+    ``ValueError`` unless clairvoyant, random_pair and some of these have run on the same episodes.
     """
     errors = errors_by_policy(rows)
     blind = [name for name in open_loop if name in errors]

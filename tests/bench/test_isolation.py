@@ -16,18 +16,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from eitbench.bench import isolation, run, suites
-from eitbench.bench.isolation import (
-    MAX_HEADER_BYTES,
-    Limits,
-    Worker,
-    WorkerError,
-    bubblewrap_problem,
-    check_out_of_reach,
-    choose_isolation,
-    decode_message,
-    encode_message,
-    readable_paths,
-)
+from eitbench.bench.isolation import Limits, Worker, WorkerError, bubblewrap_problem, choose_isolation
 from eitbench.bench.run import Job, run_episode, run_jobs
 from eitbench.bench.store import EpisodeStore
 from eitbench.bench.tracks import Environment
@@ -379,10 +368,10 @@ def test_an_unread_request_times_out(tmp_path):
 
 def test_secrets_must_be_outside_readable_folders():
     """The cache and a maintainer's secret must be outside the folders that workers can read."""
-    place = next(place for place in readable_paths() if place.is_dir() and "packages" in place.name)
+    place = next(place for place in isolation.readable_paths() if place.is_dir() and "packages" in place.name)
     with pytest.raises(ValueError, match=r"the cache folder .* must lie outside .*, which isolated methods can read"):
-        check_out_of_reach(place / "cache", "the cache folder")
-    check_out_of_reach(ROOT / "leaderboards" / "held_out.json", "a record")
+        isolation.check_out_of_reach(place / "cache", "the cache folder")
+    isolation.check_out_of_reach(ROOT / "leaderboards" / "held_out.json", "a record")
 
 
 # -- failures of episodes -----------------------------------------------------------------------
@@ -477,15 +466,12 @@ numbers = hnp.arrays(st.sampled_from([np.float64, np.float32, np.int64, np.bool_
 @given(st.dictionaries(st.text(), st.integers() | st.text() | st.none() | numbers))
 def test_messages_arrive(content):
     """Values and arrays of all shapes are decoded unchanged."""
-    values, arrays = decode_message(io.BytesIO(encode_message(content)).read)
+    values, arrays = isolation.decode_message(io.BytesIO(isolation.encode_message(content)).read)
+    assert values == {name: value for name, value in content.items() if not isinstance(value, np.ndarray)}
     assert set(values | arrays) == set(content)
-    for name, value in (values | arrays).items():
-        assert isinstance(content[name], np.ndarray) == (name in arrays)
-        if name in values:
-            assert value == content[name]
-        else:
-            assert value.dtype == content[name].dtype and value.shape == content[name].shape
-            np.testing.assert_array_equal(value, content[name])
+    for name, array in arrays.items():
+        assert array.dtype == content[name].dtype and array.shape == content[name].shape
+        np.testing.assert_array_equal(array, content[name])
 
 
 @pytest.mark.parametrize(("head", "body"), [
@@ -502,7 +488,7 @@ def test_malformed_messages_are_rejected(head, body):
     """Objects and all other dtypes that numpy would parse are rejected."""
     content = io.BytesIO(len(head).to_bytes(8, "little") + len(body).to_bytes(8, "little") + head + body)
     with pytest.raises(ValueError, match="message must"):
-        decode_message(content.read)
+        isolation.decode_message(content.read)
 
 
 def test_a_run_leaves_no_worker(tmp_path, monkeypatch):
@@ -528,8 +514,8 @@ def test_long_messages_are_not_read():
 
     def read(n):
         asked.append(n)
-        return (MAX_HEADER_BYTES + 1).to_bytes(8, "little") + bytes(8)
+        return (isolation.MAX_HEADER_BYTES + 1).to_bytes(8, "little") + bytes(8)
 
     with pytest.raises(ValueError, match="message must have at most"):
-        decode_message(read)
+        isolation.decode_message(read)
     assert asked == [16]

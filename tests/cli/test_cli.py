@@ -113,15 +113,14 @@ def test_suites():
 
 
 def test_agents_of_two_environments_may_have_one_name(tmp_path, monkeypatch):
-    """Results are stored by environment; only two files of one environment must have different names."""
+    """Results are stored by environment and name: only two files of one environment must have different names."""
     monkeypatch.setattr(suites, "builtin_methods", lambda track: [])
     monkeypatch.setattr(suites, "builtin_agents", lambda id: [write_baseline(tmp_path / id)])
     pair = ids("estimation")[:2]
     jobs = suites.make_jobs("estimation", pair, [], [1], isolate="none")
     assert [job.environment.id for job in jobs] == pair
-    files = [write_baseline(tmp_path / id) for id in pair]
     with pytest.raises(ValueError, match="have the same name"):
-        suites.make_jobs("estimation", pair[:1], files, [1], isolate="none")
+        suites.make_jobs("estimation", pair[:1], [job.method for job in jobs], [1], isolate="none")
 
 
 # -- help -------------------------------------------------------------------------------------------------------------

@@ -6,11 +6,7 @@ import re
 import numpy as np
 import pytest
 from eitbench.bench.records import write_record
-from eitbench.bench.statistics import (
-    interquartile_mean,
-    paired_difference,
-    paired_probability_of_improvement,
-)
+from eitbench.bench.statistics import interquartile_mean, paired_difference, paired_probability_of_improvement
 from eitbench.bench.text import scores_by_seed
 from eitbench.report import compare as comparison
 from eitbench.report.compare import (

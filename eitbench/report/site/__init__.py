@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 
 from markupsafe import Markup
 
-from eitbench._files import PACKAGE, bundled_path, replace_folder
+from eitbench._files import PACKAGE, replace_folder
 from eitbench._sanitize import escape_csv, escape_markdown
 from eitbench.bench.methods import baseline_folder, builtin_files, builtin_sha256, version_of
 from eitbench.bench.records import finished_at, group_runs, record_file_name, split_outdated
@@ -343,7 +343,7 @@ def _version(records: list[dict[str, Any]], addresses: dict[tuple[str, str], str
              ) -> dict[str, Any]:
     """Return the properties of one version, and its records."""
     record = records[0]
-    file = source_file(record)
+    file, docstring = _source(record)
     shown = []
     for each in sorted(records, key=lambda record: record["environment"]["name"]):
         runs = [group[0] | {"products": sorted(1000 * run["machine"]["matmul_seconds"]
@@ -356,8 +356,8 @@ def _version(records: list[dict[str, Any]], addresses: dict[tuple[str, str], str
             "commands": sorted({run["command"] for run in each["runs"]}),
             "failures": [episode for episode in each["episodes"] if episode["status"] != "ok"]})
     return {"name": record["version"], "sha256": record["method_sha256"],
-            "checkpoint": record["checkpoint_sha256"], "file": file,
-            "docstring": docstring(record, file), "records": shown,
+            "checkpoint": record["checkpoint_sha256"], "file": file, "docstring": docstring,
+            "records": shown,
             "parameters": {key: json.dumps(value, ensure_ascii=False)
                            for key, value in sorted(record["parameters"].items())}}
 
@@ -374,26 +374,18 @@ def _episodes(record: dict[str, Any]) -> Table:
         label=f"Episodes of {environment_title(record)}")
 
 
-def source_file(record: dict[str, Any]) -> str:
-    """Return the path of a built-in method's file in this repository; empty if it is not there.
+def _source(record: dict[str, Any]) -> tuple[str, Markup]:
+    """Return the path of a built-in method's file in this repository, and its docstring if the file
+    is the recorded version, by number or by content; empty where it is not there.
 
     Agents must be the very version, since others may use their names.
     """
     path = builtin_files(record["environment"]["id"]).get(record["method"])
-    if path is None or not (path.suffix == ".py" or _is_version(record, path)):
-        return ""
-    return f"baselines/{path.relative_to(baseline_folder()).as_posix()}"
-
-
-def docstring(record: dict[str, Any], file: str) -> Markup:
-    """Return the docstring of the method's file, if this repository holds the recorded version."""
-    path = bundled_path("baselines").parent / file
-    if path.suffix != ".py" or not _is_version(record, path):
-        return Markup()
-    return markdown(ast.get_docstring(ast.parse(path.read_bytes())) or "")
-
-
-def _is_version(record: dict[str, Any], path: Path) -> bool:
-    """Return whether a file is the recorded version: by number, of third parties by content."""
+    if path is None:
+        return "", Markup()
+    file = f"baselines/{path.relative_to(baseline_folder()).as_posix()}"
     sha256 = builtin_sha256(path)
-    return record["version"] == version_of(path, sha256) or sha256 == record["method_sha256"]
+    if record["version"] != version_of(path, sha256) and record["method_sha256"] != sha256:
+        return file if path.suffix == ".py" else "", Markup()
+    text = ast.get_docstring(ast.parse(path.read_bytes())) if path.suffix == ".py" else None
+    return file, markdown(text or "")
