@@ -9,7 +9,7 @@ import pytest
 
 ROOT = Path(__file__).parent.parent
 PACKAGE = ROOT / "eitbench"
-BUDGETS = {"numerics": 1590, "scoring": 110, "physics": 1420, "worlds": 2700, "data": 1530, "estimation": 5770,
+BUDGETS = {"numerics": 1590, "scoring": 110, "physics": 1420, "worlds": 2700, "data": 1530, "estimation": 5690,
            "measured": 1915, "envs": 1675, "bench": 5195, "report": 3150, "rl": 815, "cli": 1005}
 """Package (or module) -> lines of Python allowed, blank lines and docstrings included. Each imports only from those
 before it."""
