@@ -96,8 +96,8 @@ class DenseCovariance(Covariance):
     def shift(self, weights: np.ndarray, new_variance: np.ndarray) -> Self:
         """Advance a window of W values of d numbers each, the newest first, by one time step.
 
-        Each number is the sum of its past values, weighted by ``weights`` (W, d) or (W, 1), and
-        independent noise of variance ``new_variance`` (d,); the oldest value is dropped.
+        Each number is the sum of its past values, weighted by ``weights`` (W, d), and independent
+        noise of variance ``new_variance`` (d,); the oldest value is dropped.
         """
         P = self._array
         d = len(new_variance)
@@ -210,7 +210,7 @@ class LowRankCovariance(Covariance):
     """Covariance P_t = s Π_t − Z Zᵀ: few measurements of a large state, without n×n products.
 
     Measurements add columns to Z (n, r), which is propagated by F and truncated to its numerical
-    rank, far below n (``docs/methods.md``, 5). F and Q belong to the open-loop covariance.
+    rank, far below n (``docs/methods.md``, 5). F and Q belong to Π_t.
 
     Parameters
     ----------

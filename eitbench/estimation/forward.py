@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -56,5 +57,4 @@ def linearise_at_reference(task: Task, c_ref: float) -> Forward:
 def linearise_at_prediction(task: Task) -> Forward:
     """Return the linearisation of the task's voltages about each prediction, as in an extended
     Kalman filter."""
-    return lambda point, voltages, currents: linearise_voltages(task.observation, task.noise, point,
-                                                                voltages, currents)
+    return partial(linearise_voltages, task.observation, task.noise)

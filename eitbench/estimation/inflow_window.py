@@ -31,7 +31,7 @@ def yule_walker(covariance: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
 
 
 def window_model(prior: InflowPrior, steps: int,
-                 constants: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+                 constants: int = 0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return weights (W, d), variances of new values (d,), and covariance (W·d, W·d) of a window of
     ``steps`` W values of d = r + k numbers: the prior's x (r,), and constants (k,) of variance 1.
     """
@@ -82,10 +82,9 @@ class InflowWindow(StateSpace):
         """W"""
         self.time = 0
         """t"""
-        before, weights, variance = yule_walker(prior.time_covariance(self.window_steps + 1))
-        self._prior_covariance = np.kron(before, np.eye(self.n_modes))
-        self.ar_model = weights[:, None], np.full(self.n_modes, variance)
-        """Weights (W, r) or (W, 1) and variances (r,) of the entries of the next x."""
+        weights, variances, self._prior_covariance = window_model(prior, self.window_steps)
+        self.ar_model = weights, variances
+        """weights (W, r) and variances (r,) of the entries of the next x"""
 
     def initial(self) -> tuple[np.ndarray, Covariance]:
         return np.zeros(len(self._prior_covariance)), DenseCovariance(self._prior_covariance)
@@ -103,30 +102,23 @@ class InflowWindow(StateSpace):
         return self.responses[t - 1]
 
     def concentration(self, mean: np.ndarray, lag: int = 0) -> np.ndarray:
-        return self.c_ref * (1.0 + self.coordinates(mean, lag) @ self.response(lag).basis.T)
-
-    def coordinates(self, mean: np.ndarray, lag: int = 0) -> np.ndarray:
-        """Return the deviations (..., q) from c_ref in the response's basis, relative to it."""
+        basis, weights = self.response(lag)
         deviation = self.prior.inverse_link(self._recent(mean, lag) @ self.prior.modes.T) - 1.0
-        weights = self.response(lag).weights
-        return deviation.reshape(*mean.shape[:-1], -1) @ weights.reshape(len(weights), -1).T
+        deviation = deviation.reshape(*mean.shape[:-1], -1)
+        return self.c_ref * (1.0 + deviation @ weights.reshape(len(weights), -1).T @ basis.T)
 
     def variance(self, mean: np.ndarray, covariance: Covariance, lag: int = 0) -> np.ndarray:
-        slope = self.concentration_jacobian(mean, lag)
+        basis, weights = self.response(lag)
+        slope = self._by_x(mean, weights, lag)
         here = slice(lag * self.n_modes, (lag + self.response_steps) * self.n_modes)
         reduced = slope @ covariance.array[here, here] @ slope.T
         if self.residual_covariance is not None:
             reduced = reduced + self.c_ref**2 * self.residual_covariance
-        basis = self.response(lag).basis
         return ((basis @ reduced) * basis).sum(axis=1)
 
     def jacobian(self, mean: np.ndarray, matrix: np.ndarray, lag: int = 0) -> np.ndarray:
         basis, weights = self.response(lag)
         return self._by_x(mean, np.tensordot(matrix @ basis, weights, 1), lag)
-
-    def concentration_jacobian(self, mean: np.ndarray, lag: int = 0) -> np.ndarray:
-        """Return the derivatives (q, K·r) of the concentration in the basis by x."""
-        return self._by_x(mean, self.response(lag).weights, lag)
 
     def _by_x(self, mean: np.ndarray, by_inflow: np.ndarray, lag: int) -> np.ndarray:
         """Return derivatives (m, K·r) by x from those by the inflows (m, K, n_inlet)."""
@@ -140,7 +132,7 @@ class InflowWindow(StateSpace):
 
 
 def shift_window(mean: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """Return the mean (W·d,) of a window one step later, with weights (W, d) or (W, 1)."""
+    """Return the mean (W·d,) of a window one step later, with weights (W, d)."""
     values = mean.reshape(len(weights), -1)
     return np.concatenate([(weights * values).sum(axis=0)[None], values[:-1]]).ravel()
 

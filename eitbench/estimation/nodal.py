@@ -218,7 +218,7 @@ def _flowing_states(transport: Transport, prior: Prior, c_ref: float,
 def flow_motion(task: Task, transition: tuple[np.ndarray, np.ndarray], c_ref: float) -> Motion:
     """Return the motion of Table 5.1 in another flow than the task's, by its transport's F and Y.
 
-    The nodal part of the noise belongs to the task's flow: it is small, and takes long to compute.
+    The nodal part of the noise is small and takes long to compute: the task's flow determines it.
     """
     F, Y = transition
     noise = task.prior.inflow_std**2 * (Y @ Y.T) + nodal_noise(task.transport, task.prior)

@@ -80,35 +80,21 @@ class QuadraticVoltageModel:
 
     def voltages(self, concentration: np.ndarray, currents: np.ndarray) -> np.ndarray:
         """Return V (K, L) for currents (K, L) in A (A/m in 2D) and concentration (n,) in mol/m³."""
-        u, a, _ = self._logarithm(concentration)
-        return np.array([self._voltages(u, a, *self._of(each))[0] for each in currents])
+        return self.linearise(concentration, currents)[0]
 
     def linearise(self, concentration: np.ndarray,
                   currents: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return voltages (K, L) in V and derivatives by c, (K, L, n) in V·m³/mol."""
-        u, a, c = self._logarithm(concentration)
-        found = []
-        for each in currents:
-            constant, slope, curvature = self._of(each)
-            voltages, bent = self._voltages(u, a, constant, slope, curvature)
-            found.append((voltages, (slope + bent @ self._to_modes) / c))
-        voltages, by_c = map(np.array, zip(*found, strict=True))
-        return voltages, by_c
-
-    def _of(self, currents: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        return self._of_injection(np.ascontiguousarray(currents, dtype=float).tobytes())
-
-    def _voltages(self, u: np.ndarray, a: np.ndarray, constant: np.ndarray, slope: np.ndarray,
-                  curvature: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return voltages (L,) in V, and the quadratic part (L, q) of the derivatives by modes."""
-        bent = curvature @ a
-        return constant + slope @ u + 0.5 * bent @ a, bent
-
-    def _logarithm(self, concentration: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return u, its modes, and c clipped from below."""
         c = np.maximum(concentration, self.smallest)
         u = np.log(c / self.c_ref)
-        return u, self._to_modes @ u, c
+        a = self._to_modes @ u
+        voltages, by_c = [], []
+        for each in np.ascontiguousarray(currents, dtype=float):
+            constant, slope, curvature = self._of_injection(each.tobytes())
+            bent = curvature @ a
+            voltages.append(constant + slope @ u + 0.5 * bent @ a)
+            by_c.append((slope + bent @ self._to_modes) / c)
+        return np.array(voltages), np.array(by_c)
 
 
 class ScaledVoltageModel(QuadraticVoltageModel):
@@ -123,10 +109,6 @@ class ScaledVoltageModel(QuadraticVoltageModel):
         modes = _check.array("modes", modes, (None, None))
         with_level, _ = np.linalg.qr(np.column_stack([np.ones(len(modes)), modes]))
         super().__init__(_Scaled(model, c_ref), c_ref, with_level)
-
-    def voltages(self, concentration: np.ndarray, currents: np.ndarray) -> np.ndarray:
-        c = np.maximum(concentration, self.smallest)
-        return super().voltages(c, currents) / _scale(c, self.c_ref)
 
     def linearise(self, concentration: np.ndarray,
                   currents: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

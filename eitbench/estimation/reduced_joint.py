@@ -32,25 +32,18 @@ class JointModel(NamedTuple):
 
 
 class TransitionSplines:
-    """A(θ) and the covariance of w between the velocities of a model, by cubic splines.
+    """A(θ) and the covariance of w between the velocities of a model, by cubic splines."""
 
-    Parameters
-    ----------
-    model : JointModel
-    dtype : numpy float type
-        Type of the tables and of the results.
-    """
-
-    def __init__(self, model: JointModel, dtype: type = np.float64) -> None:
+    def __init__(self, model: JointModel) -> None:
         self.velocities = model.velocities
-        self._transition = self._coefficients(model.transition, dtype)
-        self._noise = self._coefficients(model.noise, dtype)
+        self._transition = self._coefficients(model.transition)
+        self._noise = self._coefficients(model.noise)
 
-    def _coefficients(self, table: np.ndarray, dtype: type) -> np.ndarray:
+    def _coefficients(self, table: np.ndarray) -> np.ndarray:
         """Return the coefficients (K − 1, 4, r, r) of (θ − θ_k)³ … 1."""
         from scipy.interpolate import CubicSpline  # lazy import: takes half a second
         coefficients = np.moveaxis(CubicSpline(self.velocities, table).c, 0, 1)
-        return np.ascontiguousarray(coefficients.astype(dtype))
+        return np.ascontiguousarray(coefficients.astype(table.dtype))
 
     def evaluate(self, velocity: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return A(θ), dA/dθ and cov(w), (B, r, r) each; θ (B,) in m/s is clipped to the table."""
@@ -76,15 +69,13 @@ class JointStates(ReducedStates):
         m/s: mean and standard deviation of θ at t = 0, and standard deviation of its steps.
     bounds : (float, float)
         m/s, least and largest θ.
-    dtype : numpy float type
-        Precision of the filter.
     """
 
     def __init__(self, model: JointModel, nominal: float, std: float, walk_std: float,
-                 bounds: tuple[float, float], dtype: type = np.float64) -> None:
-        self.basis: np.ndarray = model.basis.astype(dtype)
-        self.tables = TransitionSplines(model, dtype)
-        r = len(model.initial)
+                 bounds: tuple[float, float]) -> None:
+        self.basis = model.basis
+        self.tables = TransitionSplines(model)
+        r, dtype = len(model.initial), model.initial.dtype
         self._mean: np.ndarray = np.append(np.zeros(r), nominal).astype(dtype)
         self._covariance: np.ndarray = np.zeros((r + 1, r + 1), dtype)
         self._covariance[:r, :r] = model.initial
@@ -97,16 +88,16 @@ class JointStates(ReducedStates):
 
     def propagate(self, mean: np.ndarray,
                   covariance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        transition, noise = self._step(mean)
-        covariance = transition @ covariance @ np.swapaxes(transition, 1, 2) + noise
-        return _moved(transition, mean), covariance
+        transition, noise, after = self._step(mean)
+        return after, transition @ covariance @ np.swapaxes(transition, 1, 2) + noise
 
     def step(self, mean: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        transition, noise = self._step(mean[None])
-        return transition[0], noise[0], _moved(transition, mean[None])[0]
+        transition, noise, after = self._step(mean[None])
+        return transition[0], noise[0], after[0]
 
-    def _step(self, mean: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return [[A, (dA/dθ) a], [0, 1]] and the covariance of (w, ω), (B, r + 1, r + 1)."""
+    def _step(self, mean: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return [[A, (dA/dθ) a], [0, 1]] and the covariance of (w, ω), (B, r + 1, r + 1), and the
+        next mean (A a, θ), (B, r + 1)."""
         A, slope, W = self.tables.evaluate(mean[:, -1])
         B, r = mean[:, :-1].shape
         transition, noise = np.zeros((2, B, r + 1, r + 1), A.dtype)
@@ -115,7 +106,7 @@ class JointStates(ReducedStates):
         transition[:, :r, r] = matvec(slope, mean[:, :r])
         noise[:, :r, :r] = W
         noise[:, r, r] = self._walk_variance
-        return transition, noise
+        return transition, noise, np.append(matvec(A, mean[:, :r]), mean[:, r:], axis=1)
 
     def coordinates(self, mean: np.ndarray) -> np.ndarray:
         return mean[:, :-1]
@@ -126,12 +117,6 @@ class JointStates(ReducedStates):
 
     def constrain(self, mean: np.ndarray) -> np.ndarray:
         return np.concatenate([mean[:, :-1], np.clip(mean[:, -1:], *self._bounds)], axis=1)
-
-
-def _moved(transition: np.ndarray, mean: np.ndarray) -> np.ndarray:
-    """Return (A a, θ) of (a, θ), (B, r + 1)."""
-    a = matvec(transition[:, :-1, :-1], mean[:, :-1])
-    return np.concatenate([a, mean[:, -1:]], axis=1)
 
 
 def joint_model(basis: np.ndarray, mass: np.ndarray, initial: np.ndarray, velocities: np.ndarray,

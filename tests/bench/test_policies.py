@@ -64,11 +64,17 @@ def test_belief_is_the_filter_inside(name):
     observation, _ = env.reset(seed=SEED)
     belief = Belief(env.rules, observation)
     for pair in (7, 100, None if env.rules.budget else 3, 7):
+        predicted = belief.predict_covariance()
         observation, *_ = env.step(env.rules.action(pair))
         belief.update(observation)
         inside = filter_of(env)
         np.testing.assert_array_equal(belief.mean, inside.means()[0])
-        np.testing.assert_array_equal(filter_of(belief).covariance, inside.covariance)
+        expected = inside.filter.covariance[0].astype(float)
+        np.testing.assert_array_equal(filter_of(belief).filter.covariance[0], expected)
+        if name == NAME:                         # the predicted covariance: no measurement was rejected
+            np.testing.assert_allclose(belief.posterior_covariance(predicted, pair), expected,
+                                       atol=2e-5 * np.abs(expected).max())
+            assert belief.design_criteria(predicted)[0][pair] == pytest.approx((predicted - expected).trace(), rel=1e-3)
 
 
 def test_faulty_electrodes_have_no_design_criterion():

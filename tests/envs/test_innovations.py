@@ -34,10 +34,10 @@ def test_innovations_are_those_of_the_tasks_matrices(name, estimator):
     operator = core._filters
     n = task.mesh.n_nodes
     level = operator.c_ref[0]
-    basis = operator._shared.states.basis if estimator == "reduced" else np.eye(n)
+    basis = operator.shared.states.basis if estimator == "reduced" else np.eye(n)
     sizes = []
     for k, pair in enumerate(some_pairs()[:core.length]):
-        before = operator._filter if estimator == "reduced" else operator._filters[0]
+        before = operator.filter if estimator == "reduced" else operator._filters[0]
         mean, times = predicted(before, estimator, n)
         resting = name == BUDGET and k == 1
         observation = env.step(rules.action(None if resting else int(pair)))[0]

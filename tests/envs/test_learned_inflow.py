@@ -14,7 +14,7 @@ from eitbench.estimation.onboard.inflow_states import (
     sample_coordinates,
 )
 from eitbench.estimation.onboard.linearisation import linearisation_table, pair_currents
-from eitbench.estimation.onboard.models import load_or_build_voltages
+from eitbench.estimation.onboard.models import load_or_build_learned
 from scipy.linalg import toeplitz
 
 from injection_envs import BUDGET, FAULTS, INFLOW, filter_of, make, some_pairs
@@ -92,7 +92,7 @@ def test_node_voltages_are_those_of_all_nodes(parts):
     world = make("none", INFLOW).unwrapped.world
     observation = make_task(world).observation
     level = world.expected_concentration
-    voltages = load_or_build_voltages(world)
+    _, voltages = load_or_build_learned(world)
     samples = sample_coordinates(InflowModel(*model), response, prior, 540)[500:]
     currents = pair_currents(world)[some_pairs(len(samples))]
     levels = level * np.linspace(0.9, 1.1, len(samples))
@@ -120,9 +120,9 @@ def test_expected_error_is_that_of_the_spread():
     expected = belief.expected_error(belief.predict_covariance())
     silent = np.zeros((1, 16))
     operator.assimilate(silent, silent)
-    states = operator._shared.states
-    by_state = states.jacobian(operator.state[None], states.basis)[0]
-    covariance = by_state @ operator.covariance @ by_state.T
+    states = operator.shared.states
+    by_state = states.jacobian(operator.filter.mean.astype(float), states.basis)[0]
+    covariance = by_state @ operator.filter.covariance[0] @ by_state.T
     mass = score_mass(env.unwrapped.world).toarray()
     assert expected == pytest.approx((mass * covariance).sum(), rel=1e-4)
 
@@ -133,6 +133,6 @@ def test_other_environments_may_use_the_fitted_inflow(name):
     env = make("reduced", name, inflow="learned")
     assert env.unwrapped.world == make("none", name).unwrapped.world
     env.reset(seed=1)
-    assert isinstance(filter_of(env)._shared.single, InflowStates)
+    assert isinstance(filter_of(env).shared.single, InflowStates)
     for action in some_pairs()[:4]:
         assert np.isfinite(env.step(int(action))[1])

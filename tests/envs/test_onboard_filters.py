@@ -66,7 +66,7 @@ def test_grid_of_the_full_one_is_that_of_its_covariance():
     env.reset(seed=3)
     shown = env.step(7)[0]["std"]
     operator = filter_of(env)
-    filter_, averages = operator._filters[0], operator._table.grid_averages
+    filter_, averages = operator._filters[0], operator.table.grid_averages
     unit = np.eye(averages.shape[1])
     covariance = filter_.covariance.times(unit)
     variance = np.einsum("pn,nm,pm->p", averages, covariance, averages)

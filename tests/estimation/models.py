@@ -80,14 +80,20 @@ def draw(model, design, rng):
     return np.array(truth), observations
 
 
+def textbook_update(mean, P, H, value, variance):
+    """Return mean and covariance after measurements of the first entries of the state, and S = H P Hᵀ + R."""
+    H = np.hstack([H, np.zeros((len(H), len(P) - H.shape[1]))])
+    S = H @ P @ H.T + np.diag(variance)
+    K = np.linalg.solve(S, H @ P).T
+    return mean + K @ (value - H @ mean), P - K @ H @ P, S
+
+
 def dense_filter(model, observations):
     """Run the Kalman recursion with n×n covariances: [(predicted, filtered)] for t = 1 … T."""
     now, steps = Gaussian(model.mean, model.covariance), []
-    for H, value, variance, _ in observations:
+    for observation in observations:
         predicted = Gaussian(model.F @ now.mean + model.s, model.F @ now.covariance @ model.F.T + model.Q)
-        P = predicted.covariance
-        K = np.linalg.solve(H @ P @ H.T + np.diag(variance), H @ P).T
-        now = Gaussian(predicted.mean + K @ (value - H @ predicted.mean), P - K @ H @ P)
+        now = Gaussian(*textbook_update(*predicted, *observation[:3])[:2])
         steps.append((predicted, now))
     return steps
 

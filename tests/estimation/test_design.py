@@ -6,6 +6,7 @@ from eitbench.estimation.design import pair_design_criteria
 from eitbench.estimation.onboard.linearisation import electrode_pairs
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from models import textbook_update
 
 L, N = 5, 9
 PAIRS = electrode_pairs(L)
@@ -26,9 +27,7 @@ def gains_of(derivative, covariance, weight, noise_variance):
 
 
 def textbook(matrix: np.ndarray, covariance: np.ndarray, noise_variance: np.ndarray) -> np.ndarray:
-    """Return P − P Hᵀ (H P Hᵀ + R)⁻¹ H P."""
-    S = matrix @ covariance @ matrix.T + np.diag(noise_variance)
-    return covariance - covariance @ matrix.T @ np.linalg.inv(S) @ matrix @ covariance
+    return textbook_update(np.zeros(N), covariance, matrix, np.zeros(len(matrix)), noise_variance)[1]
 
 
 @settings(max_examples=20)

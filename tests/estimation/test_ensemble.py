@@ -16,7 +16,7 @@ from eitbench.estimation import (
     linearise_at_prediction,
 )
 from eitbench.worlds.task import make_task
-from models import MESH, averages, coarse_transport, directions, shapes, two_modes
+from models import MESH, averages, coarse_transport, directions, shapes, textbook_update, two_modes
 
 from tiny_worlds import TINY
 
@@ -64,16 +64,13 @@ def test_a_measurement_is_the_kalman_update_of_the_members_moments():
     filter_.update(seen)
     estimate = filter_.estimate()
     innovation, covariance = estimate.innovation, estimate.innovation_covariance
-    n = len(MESH.points)
-    P = np.cov(before)
-    S = seen.matrix @ P[:n, :n] @ seen.matrix.T + np.diag(seen.noise_variance)
-    gain = np.linalg.solve(S, seen.matrix @ P[:n]).T
-    expected = seen.value - seen.matrix @ before[:n].mean(axis=1)
-    np.testing.assert_allclose(innovation, expected, rtol=1e-9)
+    n, P = len(MESH.points), np.cov(before)
+    mean, less, S = textbook_update(before.mean(axis=1), P, *seen[:3])
+    np.testing.assert_allclose(innovation, seen.value - seen.matrix @ before[:n].mean(axis=1), rtol=1e-9)
     np.testing.assert_allclose(covariance, S, rtol=1e-9)
     after = together(filter_)
-    np.testing.assert_allclose(after.mean(axis=1), before.mean(axis=1) + gain @ expected, rtol=1e-9, atol=1e-9)
-    np.testing.assert_allclose(np.cov(after), P - gain @ S @ gain.T, atol=1e-9 * np.abs(P).max())
+    np.testing.assert_allclose(after.mean(axis=1), mean, rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(np.cov(after), less, atol=1e-9 * np.abs(P).max())
     np.testing.assert_allclose(estimate.variance, np.cov(after).diagonal()[:n], rtol=1e-9)
 
 

@@ -16,7 +16,7 @@ from eitbench.estimation import (
     linearise_at_prediction,
 )
 from eitbench.estimation.switching_inflow import resample
-from models import by_window, two_modes, window_law
+from models import by_window, textbook_update, two_modes, window_law
 from models import tiny_task as task
 from scipy.stats import multivariate_normal
 
@@ -61,11 +61,9 @@ def enumerated(filter_, regimes, measured):
         for before, now, seen in zip(sequence, sequence[1:], measured, strict=False):
             m, P = laws[now].F @ m, laws[now].F @ P @ laws[now].F.T + laws[now].Q
             H = seen.matrix @ G
-            S = H @ P @ H.T + np.diag(seen.noise_variance)
-            expected = seen.matrix @ np.full(len(G), LEVEL) + H @ m
-            log += np.log(chain[before][now]) + multivariate_normal.logpdf(seen.value, expected, S)
-            gain = np.linalg.solve(S, H @ P).T
-            m, P = m + gain @ (seen.value - expected), P - gain @ S @ gain.T
+            value, expected = seen.value - LEVEL * seen.matrix.sum(axis=1), H @ m
+            m, P, S = textbook_update(m, P, H, value, seen.noise_variance)
+            log += np.log(chain[before][now]) + multivariate_normal.logpdf(value, expected, S)
         found.append((log, sequence[-1], LEVEL + G @ m, ((G @ P) * G).sum(axis=1)))
     logs, last, means, variances = map(np.array, zip(*found, strict=True))
     weight = np.exp(logs - logs.max())

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from eitbench.data.episode_cache import scoring_constants
 from eitbench.estimation.design import pair_design_criteria
 from eitbench.estimation.onboard.linearisation import linearisation_table
 from eitbench.estimation.onboard.reduced_filters import ReducedFilters
@@ -40,6 +41,7 @@ class Belief:
     def __init__(self, rules: Rules, observation: dict[str, np.ndarray]) -> None:
         self.rules = rules
         self._filters = ReducedFilters(rules, observation["frame"][None])
+        self._shared = self._filters.shared
         self._true_states: np.ndarray | None = None
         self._clear_cache()
         measuring, self._driving = observation["doubt"]
@@ -79,14 +81,32 @@ class Belief:
 
     def condition_on_truth(self, entries: np.ndarray) -> None:
         """Linearise later steps about the truth, the entries of the cached episode from the present
-        t on; for oracles only."""
-        self._true_states = self._filters.true_states(entries)
+        t on; for oracles only. ``ValueError`` with a learned inflow."""
+        if self.rules.inflow == "learned":
+            raise ValueError("inflow must be 'white' for true states, got 'learned': the cached "
+                             "episode does not include the inflow")
+        world = self.rules.world
+        level = self._filters.c_ref[0]
+        mass = scoring_constants(world).mass
+        whole = 0.5 * (mass.sum(axis=0) + mass.sum(axis=1))  # ∫ of each basis function
+        beyond = (world.background - level) * whole + entries["moment"]
+        states = beyond @ self._shared.states.basis / level
+        flow = world.velocity_model
+        if flow is not None:
+            square = flow.profiles[:, 0]**2 @ flow.weights
+            states = np.column_stack([states, entries["velocity_moment"][:, 0] / square])
+        self._true_states = states
         self._clear_cache()
 
     def _clear_cache(self) -> None:
         self._steps: list[tuple[np.ndarray, ...]] = []
         vars(self).pop("linearisation", None)
         vars(self).pop("_weight", None)
+
+    @property
+    def _state(self) -> np.ndarray:
+        """(s,) present mean in double precision."""
+        return self._filters.filter.mean[0].astype(float)
 
     @property
     def mean(self) -> np.ndarray:
@@ -112,17 +132,18 @@ class Belief:
         effect of a velocity error depends on the concentration.
         """
         transition, noise, _ = self._step(steps_ahead)
-        start = self._filters.covariance if covariance is None else covariance
-        return transition @ start @ transition.T + noise
+        if covariance is None:
+            covariance = self._filters.filter.covariance[0].astype(float)
+        return transition @ covariance @ transition.T + noise
 
     def _step(self, steps_ahead: int) -> tuple[np.ndarray, ...]:
         """Return the Jacobian of the step that starts ``steps_ahead`` steps from now, its noise
-        covariance and the mean after it."""
-        if steps_ahead >= len(self._steps):
-            count = max(steps_ahead + 1, 2 * len(self._steps))
+        covariance and the mean after it, linearised at the predicted mean or the true state."""
+        for k in range(len(self._steps), steps_ahead + 1):
+            before = self._steps[-1][2] if self._steps else self._state
             if self._true_states is not None:
-                count = len(self._true_states)
-            self._steps = self._filters.steps(count, self._true_states)
+                before = self._true_states[k]
+            self._steps.append(self._shared.states.step(before))
         return self._steps[steps_ahead]
 
     def expected_error(self, covariance: np.ndarray) -> float:
@@ -212,7 +233,10 @@ class Belief:
     def linearisation(self) -> Linearisation:
         """Linearisation of 𝓡 for the next measurement: about c_ref, or with a learned inflow about
         the prediction."""
-        return self._filters.linearisation(self._step(0)[2])
+        state = self._step(0)[2]
+        coordinates = self._shared.states.coordinates(state[None])[0]
+        about = self._shared.linearisation(self._filters.indices[0], coordinates)
+        return about._replace(jacobian=self._by_state(state, about.jacobian))
 
     @property
     def jacobian(self) -> np.ndarray:
@@ -221,11 +245,26 @@ class Belief:
 
     def relinearised_jacobian(self) -> np.ndarray:
         """Return the derivatives (L, L, s) of 𝓡 about the present estimate, in about 10 ms."""
-        return self._filters.relinearised_jacobian()
+        level = self._filters.c_ref[0]
+        positive = np.maximum(self.mean, 0.1 * level)
+        _, table = self._filters.table.task.observation.resistance_derivatives(positive)
+        by_coordinates = level * np.tensordot(table, self._shared.states.basis, axes=(0, 0))
+        return self._by_state(self._state, by_coordinates)
+
+    def _by_state(self, state: np.ndarray, table: np.ndarray) -> np.ndarray:
+        """Return derivatives (…, …, s) by the state from derivatives (…, …, q) by the
+        coordinates."""
+        flat = table.reshape(-1, table.shape[-1])
+        by_state = self._shared.states.jacobian(state[None], flat).reshape(len(flat), -1)
+        return by_state.reshape(*table.shape[:2], -1)
 
     @cached_property
     def _weight(self) -> np.ndarray:
-        return self._filters.weight(self._step(0)[2])
+        """(s, s) W: tr(W P) is the expected squared error, integrated over the scored region,
+        relative to c_ref²."""
+        state = self._step(0)[2]
+        half = self._by_state(state, self._shared.weight[None])[0]
+        return self._by_state(state, half.T[None])[0]
 
     @property
     def _noise_variance(self) -> np.ndarray:

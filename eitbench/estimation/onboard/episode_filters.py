@@ -43,14 +43,15 @@ class EpisodeFilters(Protocol):
     c_ref: np.ndarray
     """(B,) ĉ_bh in mol/m³"""
     _rules: Rules
-    _table: LinearisationTable
-    _indices: list[int]
+    table: LinearisationTable
+    indices: list[int]
+    """indices of c_ref in the table"""
 
     def __init__(self, rules: Rules, frames: np.ndarray) -> None:
         self._rules = rules
-        self._table = linearisation_table(rules.world)
-        self._indices = self._table.nearest_indices(frames, rules.gate)
-        self.c_ref = np.array([self._table.c_ref(k) for k in self._indices])
+        self.table = linearisation_table(rules.world)
+        self.indices = self.table.nearest_indices(frames, rules.gate)
+        self.c_ref = np.array([self.table.c_ref(k) for k in self.indices])
         self._start(len(frames))
         for k, currents in enumerate(rules.world.currents):
             self.assimilate(frames[:, k], np.repeat(currents[None], len(frames), axis=0))

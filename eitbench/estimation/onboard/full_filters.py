@@ -57,16 +57,16 @@ class FullFilters(EpisodeFilters):
         """Return the measurement (L,) of the relative concentration (n,) of an episode."""
         c_ref = self.c_ref[b]
         if self._rules.inflow == "white":
-            linearisation = self._table.linearisation(self._indices[b])
+            linearisation = self.table.linearisation(self.indices[b])
             computed = currents @ linearisation.resistance
             matrix = linearisation.by_state(currents)
             about = np.ones(matrix.shape[1])
         else:
             about = self._filters[b].concentration
-            (computed,), (by_c,) = self._table.task.observation.linearise(c_ref * about,
+            (computed,), (by_c,) = self.table.task.observation.linearise(c_ref * about,
                                                                           currents[None])
             matrix = c_ref * by_c
-        std = self._table.noise_std(computed, self._rules.instrument.noise_floor)
+        std = self.table.noise_std(computed, self._rules.instrument.noise_floor)
         return LinearMeasurement(matrix, voltages - computed + matrix @ about, std**2)
 
     def innovations(self) -> list[Innovation | None]:
@@ -76,7 +76,7 @@ class FullFilters(EpisodeFilters):
 
     def coarse_grid(self) -> tuple[np.ndarray, np.ndarray]:
         # One product per episode: the bits of a joint product depend on the number of episodes.
-        averages = self._table.grid_averages
+        averages = self.table.grid_averages
         mean = (averages @ self.means()[..., None])[..., 0]
         variance = np.array([each.covariance.variance_of(each.space.jacobian(each.mean, averages))
                              for each in self._filters])

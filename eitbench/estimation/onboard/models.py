@@ -70,7 +70,7 @@ FLOAT64_ARRAYS = ("velocities",)
 def reduced_states(world: World, inflow: str) -> tuple[ReducedStates, ReducedStates]:
     """Return the reduced state space of a world in double and in single precision."""
     if inflow == "learned":
-        learned = InflowModel(**_learned(world, "model"))
+        learned, _ = load_or_build_learned(world)
         return InflowStates(learned), InflowStates(single_precision(learned))
     model = load_or_build_model(world)
     if isinstance(model, ReducedModel):
@@ -78,22 +78,18 @@ def reduced_states(world: World, inflow: str) -> tuple[ReducedStates, ReducedSta
     flow = require_scalar_velocity(make_task(world))
     bounds = (VELOCITY_BOUNDS[0] * flow.nominal[0], VELOCITY_BOUNDS[1] * flow.nominal[0])
     how = flow.nominal[0], flow.initial_std[0], flow.walk_std[0], bounds
-    return JointStates(model, *how), JointStates(model, *how, np.float32)
+    return JointStates(model, *how), JointStates(single_precision(model), *how)
 
 
 def single_precision(model: Any) -> Any:
-    """Return a named tuple of arrays in single precision."""
-    return type(model)(*(array.astype(np.float32) for array in model))
+    """Return a named tuple of arrays in single precision, except `FLOAT64_ARRAYS`."""
+    return model._replace(**{name: array.astype(np.float32) for name, array
+                             in model._asdict().items() if name not in FLOAT64_ARRAYS})
 
 
-def load_or_build_voltages(world: World) -> NodeVoltages:
-    """Return the voltages of a world in the basis of its learned inflow."""
-    return NodeVoltages(**_learned(world, "voltages"))
-
-
-def _learned(world: World, part: str) -> dict[str, np.ndarray]:
-    """Return the arrays of a world's ``model``, an `InflowModel`, or ``voltages``,
-    `NodeVoltages`, rounded to single precision."""
+def load_or_build_learned(world: World) -> tuple[InflowModel, NodeVoltages]:
+    """Return the reduced model with a learned inflow and the voltages in its basis, rounded to
+    single precision."""
     def build() -> dict[str, np.ndarray]:
         task = make_task(world)
         prior = fit_world_prior(world)
@@ -103,14 +99,15 @@ def _learned(world: World, part: str) -> dict[str, np.ndarray]:
             samples = sample_coordinates(model, response, prior, N_SAMPLES)
             voltages = node_voltages(task.observation, world.expected_concentration, model.basis,
                                      samples)
-        parts = {"model": model._asdict(), "voltages": voltages._asdict()}
-        return {f"{part}.{name}": array.astype(np.float32) for part, arrays in parts.items()
-                for name, array in arrays.items()}
+        return {f"{part}.{name}": array.astype(np.float32)
+                for part, made in (("model", model), ("voltages", voltages))
+                for name, array in made._asdict().items()}
 
-    key = model_key("learned", config_dict(world.fault_free), LEARNED_MODEL_VERSION)
-    arrays = cached(key, build)
-    return {name.removeprefix(part + "."): array.astype(float) for name, array in arrays.items()
-            if name.startswith(part)}
+    arrays = cached(model_key("learned", config_dict(world.fault_free), LEARNED_MODEL_VERSION),
+                    build)
+    return (InflowModel(*(arrays[f"model.{name}"].astype(float) for name in InflowModel._fields)),
+            NodeVoltages(*(arrays[f"voltages.{name}"].astype(float)
+                           for name in NodeVoltages._fields)))
 
 
 def load_or_build_model(world: World) -> ReducedModel | JointModel:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from eitbench.data.episode_cache import score_mass, scoring_constants
+from eitbench.data.episode_cache import score_mass
 from eitbench.estimation.onboard.episode_filters import EpisodeFilters, Innovation
 from eitbench.estimation.onboard.linearisation import (
     Linearisation,
@@ -15,7 +15,7 @@ from eitbench.estimation.onboard.linearisation import (
     std_from_variance,
 )
 from eitbench.estimation.onboard.models import (
-    load_or_build_voltages,
+    load_or_build_learned,
     reduced_states,
     single_precision,
 )
@@ -30,23 +30,23 @@ class ReducedFilters(EpisodeFilters):
     """Reduced filters of B episodes in single precision."""
 
     def _start(self, episodes: int) -> None:
-        self._shared = SharedData.of(self._rules)
-        self._filter = ReducedFilter(self._shared.single, episodes)
+        self.shared = SharedData.of(self._rules)
+        self.filter = ReducedFilter(self.shared.single, episodes)
 
     def assimilate(self, voltages: np.ndarray,
                    currents: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        self._filter.predict()
-        states = self._shared.single
-        mean = self._filter.mean
+        self.filter.predict()
+        states = self.shared.single
+        mean = self.filter.mean
         coordinates = states.coordinates(mean)
-        computed, matrix, about = self._shared.linearise(self._indices, coordinates, currents)
+        computed, matrix, about = self.shared.linearise(self.indices, coordinates, currents)
         driven = currents.any(axis=1, keepdims=True)
-        std = self._table.noise_std(computed, self._rules.instrument.noise_floor)
+        std = self.table.noise_std(computed, self._rules.instrument.noise_floor)
         std = np.where(driven, std, 1.0)
         matrix /= std[..., None].astype(np.float32)
         residual = ((voltages - computed) / std).astype(np.float32) * driven
         innovation = residual - matvec(matrix, coordinates - about)
-        variance, accepted = self._filter.update(
+        variance, accepted = self.filter.update(
             states.jacobian(mean, matrix), innovation, np.ones_like(residual),
             gate=self._rules.gate)
         self._last = innovation, std, accepted, currents
@@ -55,24 +55,24 @@ class ReducedFilters(EpisodeFilters):
     def innovations(self) -> list[Innovation | None]:
         innovation, std, accepted, currents = self._last
         used = accepted & currents.any(axis=1, keepdims=True)
-        S = self._filter.innovation_covariance * (std[:, :, None] * std[:, None])
+        S = self.filter.innovation_covariance * (std[:, :, None] * std[:, None])
         return [Innovation.of(*each) for each in zip(innovation * std, S, used, strict=True)]
 
     @property
     def coordinates(self) -> np.ndarray:
         """(B, q) present coordinates of the concentration."""
-        return self._shared.single.coordinates(self._filter.mean)
+        return self.shared.single.coordinates(self.filter.mean)
 
     def coarse_grid(self) -> tuple[np.ndarray, np.ndarray]:
-        patches = self._shared.patches
+        patches = self.shared.patches
         mean = 1.0 + matvec(patches, self.coordinates)
         level = self.c_ref[:, None]
         return level * mean, level * self._deviation(patches)
 
     def _deviation(self, functionals: np.ndarray) -> np.ndarray:
         """Return the standard deviations (B, m) of functionals (m, q) of the coordinates."""
-        by_state = self._shared.single.jacobian(self._filter.mean, functionals)
-        variance = ((by_state @ self._filter.covariance) * by_state).sum(axis=2, dtype=float)
+        by_state = self.shared.single.jacobian(self.filter.mean, functionals)
+        variance = ((by_state @ self.filter.covariance) * by_state).sum(axis=2, dtype=float)
         return std_from_variance(variance)
 
     def errors(self, moments: np.ndarray, deviations: np.ndarray,
@@ -80,96 +80,25 @@ class ReducedFilters(EpisodeFilters):
         level = self.c_ref[:, None]
         state = np.concatenate([level - self._rules.world.background, level * self.coordinates],
                                axis=1)
-        quadratic = (state * matvec(self._shared.mass, state)).sum(axis=1)
+        quadratic = (state * matvec(self.shared.mass, state)).sum(axis=1)
         return (quadratic - 2.0 * (state * moments).sum(axis=1) + deviations) / squares
 
     def means(self) -> np.ndarray:
         return self.c_ref[:, None] * (
-            1.0 + self.coordinates @ self._shared.states.basis.T)
+            1.0 + self.coordinates @ self.shared.states.basis.T)
 
     def stds(self) -> np.ndarray:
-        return self.c_ref[:, None] * self._deviation(self._shared.single.basis)
+        return self.c_ref[:, None] * self._deviation(self.shared.single.basis)
 
     def velocity(self) -> tuple[np.ndarray, np.ndarray] | None:
         if self._rules.world.velocity_model is None:
             return None
-        variance = self._filter.covariance[:, -1, -1:].astype(float)
-        return self._filter.mean[:, -1:].astype(float), std_from_variance(variance)
+        variance = self.filter.covariance[:, -1, -1:].astype(float)
+        return self.filter.mean[:, -1:].astype(float), std_from_variance(variance)
 
     @staticmethod
     def project(rules: Rules, moment: np.ndarray) -> np.ndarray:
         return np.asarray(moment @ SharedData.of(rules).basis)
-
-    # The following members refer to the first episode, in double precision, for `Belief`.
-
-    @property
-    def state(self) -> np.ndarray:
-        """(s,) mean of the present state."""
-        return self._filter.mean[0].astype(float)
-
-    @property
-    def covariance(self) -> np.ndarray:
-        """(s, s) covariance of the present state."""
-        return self._filter.covariance[0].astype(float)
-
-    def linearisation(self, state: np.ndarray) -> Linearisation:
-        """Return the filter's linearisation of 𝓡, derivatives (L, L, s), at a predicted mean (s,).
-        """
-        states = self._shared.states
-        about = self._shared.linearisation(self._indices[0], states.coordinates(state[None])[0])
-        return about._replace(jacobian=self._by_state(state, about.jacobian))
-
-    def relinearised_jacobian(self) -> np.ndarray:
-        """Return the derivatives (L, L, s) of 𝓡 about the present estimate, computed exactly."""
-        level = self.c_ref[0]
-        positive = np.maximum(self.means()[0], 0.1 * level)
-        _, table = self._table.task.observation.resistance_derivatives(positive)
-        by_coordinates = level * np.tensordot(table, self._shared.states.basis, axes=(0, 0))
-        return self._by_state(self.state, by_coordinates)
-
-    def _by_state(self, state: np.ndarray, table: np.ndarray) -> np.ndarray:
-        """Return derivatives (…, …, s) by the state from derivatives (…, …, q) by the
-        coordinates."""
-        flat = table.reshape(-1, table.shape[-1])
-        by_state = self._shared.states.jacobian(state[None], flat).reshape(len(flat), -1)
-        return by_state.reshape(*table.shape[:2], -1)
-
-    def weight(self, state: np.ndarray) -> np.ndarray:
-        """Return W (s, s) at a mean (s,): tr(W P) is the expected squared error, integrated over
-        the scored region, relative to c_ref²."""
-        half = self._by_state(state, self._shared.weight[None])[0]
-        return self._by_state(state, half.T[None])[0]
-
-    def steps(self, count: int,
-              along: np.ndarray | None = None) -> list[tuple[np.ndarray, ...]]:
-        """Return for each of the next ``count`` steps the Jacobian, the noise covariance, (s, s)
-        each, and the mean (s,) after it, linearised at the predicted means, or at the states
-        ``along`` (count, s) before each step."""
-        mean = self.state
-        made: list[tuple[np.ndarray, ...]] = []
-        for k in range(count):
-            mean = mean if along is None else along[k]
-            transition, noise, mean = self._shared.states.step(mean)
-            made.append((transition, noise, mean))
-        return made
-
-    def true_states(self, entries: np.ndarray) -> np.ndarray:
-        """Return the true states (T, s) of the first episode from its cached data, for oracles.
-        ``ValueError`` with a learned inflow, which the cached data do not include."""
-        if self._rules.inflow == "learned":
-            raise ValueError("inflow must be 'white' for true states, got 'learned': the cached "
-                             "episode does not include the inflow")
-        world = self._rules.world
-        level = self.c_ref[0]
-        mass = scoring_constants(world).mass
-        whole = 0.5 * (mass.sum(axis=0) + mass.sum(axis=1))  # ∫ of each basis function
-        beyond = (world.background - level) * whole + entries["moment"]
-        states = beyond @ self._shared.states.basis / level
-        flow = self._table.task.velocity
-        if flow is None:
-            return np.asarray(states)
-        square = flow.profiles[:, 0]**2 @ flow.weights
-        return np.column_stack([states, entries["velocity_moment"][:, 0] / square])
 
 
 class SharedData:
@@ -183,7 +112,7 @@ class SharedData:
         self._made_of = world, inflow
         self.levels = linearisation_table(world)
         self.states, self.single = reduced_states(world, inflow)
-        voltages = load_or_build_voltages(world) if inflow == "learned" else None
+        voltages = load_or_build_learned(world)[1] if inflow == "learned" else None
         self._voltages = voltages
         self._single_voltages = None if voltages is None else single_precision(voltages)
         self._level = cache(self._projected)
