@@ -173,7 +173,7 @@ LARGE[2, 7] = -250.1
 def test_wrong_actions_are_named_and_change_nothing(action, message):
     """An invalid action is rejected with its value and the expectation; a valid one is accepted afterwards."""
     envs = make()
-    actions = actions_for(envs, 7)
+    actions = actions_for(envs, 5)
     played = play(envs, actions, seed=1)
     steps = []
     envs.reset(seed=1)
