@@ -2,13 +2,12 @@
 
 import csv
 import io
-import json
 from pathlib import Path
 
 import numpy as np
 import pytest
 from eitbench.bench import scores
-from eitbench.bench.records import read_records
+from eitbench.bench.records import read_record
 from eitbench.bench.scores import Outcome, Score, compute_scores, register_score
 from eitbench.report import compare
 from eitbench.report.boards import run_leaderboards
@@ -64,17 +63,22 @@ def worst(direction="lower"):
                  direction=direction, factor=100.0)
 
 
-def test_a_new_score_is_shown_everywhere(apart):
+@pytest.fixture
+def records():
+    """Return published records of a naive baseline and a filter, with that score."""
+    found = [read_record(path) for method in ("homogeneous", "kalman_filter")
+             for path in PUBLISHED.glob(f"eitbench-Pipe2D-v0--{method}--*.json")]
+    assert [record["method"] for record in found] == ["homogeneous", "kalman_filter"]
+    for record in found:
+        for episode in record["episodes"]:
+            episode["scores"]["worst_step"] = max(episode["step_errors"])
+    return found
+
+
+def test_a_new_score_is_shown_everywhere(apart, records):
     """After one call it is in episodes, summaries, CSV, Markdown, pages and comparisons, in its unit."""
     register_score(worst())
     assert compute_scores("estimation", outcome())["worst_step"] == pytest.approx(0.3)
-    records = [record for record in read_records(PUBLISHED)
-               if record["environment"]["name"] == "eitbench-Pipe2D-v0"
-               and record["method"] in ("kalman_filter", "homogeneous")]
-    assert len(records) == 2
-    for record in records:
-        for episode in record["episodes"]:
-            episode["scores"]["worst_step"] = max(episode["step_errors"])
     expected = {record["method"]: 100.0 * np.mean([max(episode["step_errors"])
                                                    for episode in record["episodes"]]) for record in records}
     assert "worst" in run_table(run_leaderboards(records)[0]).headings
@@ -85,32 +89,24 @@ def test_a_new_score_is_shown_everywhere(apart):
     assert "| worst |" in made["leaderboard.md"] and "**worst**: the worst step" in made["leaderboard.md"]
     site = render_site(collect(records))
     assert "the worst step" in site["environments/eitbench-Pipe2D-v0.html"].decode()
-    a, b = ([record for record in records if record["method"] == name]
-            for name in ("kalman_filter", "homogeneous"))
-    table = compare.compare(a, b, "worst_step")
+    table = compare.compare(records[1:], records[:1], "worst_step")
     assert table["a"][0] == pytest.approx(expected["kalman_filter"]) and table["better"][0] == 1.0
     assert said(compare.comparison_table(table, "kalman", "floor", "worst_step"))["better"][0] == "kalman"
 
 
-def test_higher_scores_can_be_better(apart):
+def test_higher_scores_can_be_better(apart, records):
     """The sign of the comparison follows the direction of the score."""
     register_score(worst("higher"))
-    records = {record["method"]: record for record in read_records(PUBLISHED)
-               if record["environment"]["name"] == "eitbench-Pipe2D-v0"}
-    for record in records.values():
-        for episode in record["episodes"]:
-            episode["scores"]["worst_step"] = max(episode["step_errors"])
-    table = compare.compare([records["kalman_filter"]], [records["homogeneous"]], "worst_step")
+    table = compare.compare(records[1:], records[:1], "worst_step")
     assert table["better"][0] == 0.0
     assert said(compare.comparison_table(table, "kalman", "floor", "worst_step"))["better"][0] == "floor"
 
 
 @pytest.mark.parametrize("name", ["nis", "voltage_discrepancy", "beauty"])
-def test_only_scores_with_a_direction_are_compared(name):
+def test_only_scores_with_a_direction_are_compared(name, records):
     """The message lists the scores that can."""
-    record = json.loads((next(PUBLISHED.glob("eitbench-Pipe2D-v0--kalman*"))).read_text())
     with pytest.raises(ValueError, match=f"score must be one of error, .*got '{name}'"):
-        compare.compare([record], [record], name)
+        compare.compare(records[1:], records[1:], name)
 
 
 @pytest.mark.parametrize(("changes", "message"), [

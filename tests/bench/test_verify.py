@@ -21,7 +21,7 @@ from eitbench.data.seeds import SPLITS, parse_seeds
 
 from commands import eitbench
 from short import shorten
-from tiny import FILTER, git_says, write_baseline
+from tiny import FILTER, SMOOTHING, git_says, write_baseline
 from tiny_worlds import TINY
 
 INJECTION = "eitbench/Pipe2DInjection-v0"
@@ -36,7 +36,7 @@ confined = pytest.mark.skipif(bool(bubblewrap_problem()), reason=bubblewrap_prob
 def tiny_world(monkeypatch, tmp_path):
     """Use tiny worlds for the registered ids, and an empty folder."""
     git_says(monkeypatch)
-    shorten(monkeypatch, FILTER.id, INJECTION, CURRENTS)
+    shorten(monkeypatch, FILTER.id, SMOOTHING.id, INJECTION, CURRENTS)
     monkeypatch.setattr(held_out, "COMMITMENT", tmp_path / "held_out.json")
     monkeypatch.chdir(tmp_path)
     yield
@@ -229,8 +229,8 @@ def test_the_cache_is_not_used(mine, tmp_path, monkeypatch):
 
 def test_all_official_records_are_verified_and_a_false_one_is_reported(monkeypatch):
     """A repeated command resumes. Damaged files are reported before any episode is run."""
-    for path in (submitted("homogeneous", "test:0-2"), submitted("random_pair", "test:0-2", INJECTION, "--policy")):
-        changed(path, official)
+    for env in (FILTER.id, SMOOTHING.id):
+        changed(submitted("homogeneous", "test:0-2", env), official)
     changed(submitted("persistence", "test:0-2"), lambda record: None)               # self-reported: not verified
     command = ("verify", "--all", "--records", "forged/results", "--out", "again", "--episodes", 2, "-j", 1)
     code, said, complaint = eitbench(*command)

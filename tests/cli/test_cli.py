@@ -206,7 +206,7 @@ def test_documented_commands_are_commands():
     (["render", "--baseline", "fixed_interval_smoother"], "smoothing, but eitbench/Pipe2D-v0 is a filter"),
     (["render", "--env", INJECTION], f"policy must be given for {INJECTION}"),
     (["render", "--env", INJECTION, "--policy", "random_pair", "--step", "1", "-o", "a.png"],
-     "step must be an integer of at least 3 and at most 5, got 1"),
+     "step must be an integer of at least 17 and at most 22, got 1"),
     (["run", "--policy", "random_pair"], "env must be given with policy"),
     (["run", "--env", INJECTION, "--baseline", "kalman_filter"], "one run must be of estimators or of injection"),
     (["run", "--env", INJECTION, "--records", "nowhere"], "--records must be a folder, got nowhere"),

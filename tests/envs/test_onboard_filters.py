@@ -29,7 +29,7 @@ def of_a_baseline(name, env) -> Filter:
 
 @pytest.mark.parametrize(("name", "estimator"), [(NAME, "full"), (FLOW, "full"), (INFLOW, "full"), (NAME, "reduced"),
                                                  (INFLOW, "reduced")])
-def test_filter_is_that_of_a_baseline(name, estimator):
+def test_filter_is_the_full_one_of_a_baseline(name, estimator):
     """The full filter has its mean, spread, velocity and innovation at each step; the RMS difference of the reduced one
     is less than 1 mol/m³, with a learned inflow also than a tenth of the standard deviation."""
     env = make(estimator, name).unwrapped

@@ -201,7 +201,7 @@ def test_injection_is_drawn(monkeypatch, run_cache, tmp_path):
     assert list(run_seeds.items()) == [((env, "{}"), entry(env).test_seeds) for env in injection.WORLDS]
     assert description.count("best_pair ") == 6
     with Image.open(tmp_path / "new" / "injection.gif") as animation:
-        assert animation.n_frames == 6                        # the first frame of 16, then six steps
+        assert animation.n_frames == 4                                                 # scored states
 
 
 def test_thesis_figures_show_dev_episodes_by_default(monkeypatch, tmp_path):
