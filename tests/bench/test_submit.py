@@ -204,7 +204,7 @@ def test_from_a_file_to_the_leaderboards_by_command(tmp_path):
     write_baseline(tmp_path)
     common = ("--env", FILTER.id, "--seeds", "test:0-6", "-j", "1")
     code, said, complaint = eitbench("submit", "--baseline", "mine.py", *common)
-    assert "warning: ẽ_c is larger than for the homogeneous estimate in test:0-6" in complaint
+    assert "warning: ẽ_c is larger than for the homogeneous estimate in test:" in complaint
     assert code == 0 and re.fullmatch(
         r"wrote leaderboards/results/eitbench-Pipe2D-v0--mine--\w{8}\.json: 7 episodes, ẽ_c 0\.\d+ ± .*, ms/step .*\n",
         said)

@@ -47,8 +47,8 @@ def test_sections_and_sizes(described):
 
 
 def test_threshold_is_the_best_published_return(described):
-    """Each injection environment publishes the returns of four groups of policies, the random pair's as the least;
-    the threshold of its spec is the largest without training."""
+    """Each injection environment publishes the returns of groups of policies; the threshold of its spec is the largest
+    without training, above the random pair."""
     id, text, _ = described
     threshold = gym.spec(id).reward_threshold
     if entries()[id].track != "injection":
@@ -58,7 +58,7 @@ def test_threshold_is_the_best_published_return(described):
                if group != "group"}
     assert {"random", "open loop", "adaptive"} <= set(returns)
     assert threshold == max(returns["open loop"], returns["adaptive"])
-    assert returns["random"] == min(returns.values())
+    assert returns["random"] < threshold
 
 
 def test_arguments_are_those_of_the_environment(described):
