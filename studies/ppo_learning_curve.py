@@ -63,6 +63,14 @@ def main() -> None:
         PPO("MlpPolicy", gym.make(ID), seed=seed, device="cpu").learn(STEPS, callback=evaluation)
         curves.append(evaluation.curve)
     curve = np.array(curves)
+    draw(curve)
+    for step in range(curve.shape[1]):
+        stochastic, greedy = np.round(curve[:, step, 1:].T, 3)
+        print(f"{curve[0, step, 0]:7.0f} steps: stochastic {stochastic}, greedy {greedy}")
+
+
+def draw(curve: np.ndarray) -> None:
+    """Draw a curve (agents, evaluations, 3) of steps and the returns of both action rules."""
     steps = curve[0, :, 0] / 1000
     figure, axes = plt.subplots(figsize=(7, 3.4), layout="constrained")
     for column, name, colour in ((1, "PPO, stochastic", "#7f8fa6"),
@@ -73,14 +81,10 @@ def main() -> None:
     for row, style in zip(published_returns(ID), ("dotted", "dashed", "dashdot"), strict=False):
         axes.axhline(float(row["mean"]), color="#26a269", linestyle=style,
                      label=f"{row['group']}: {row['policy']}")
-        print(f"{row['group']}: {row['policy']} {row['mean']}")
     axes.set(xlabel="thousands of steps", ylabel="sum of rewards, dev:0-31")
-    axes.legend(frameon=False, fontsize=9)
+    axes.legend(frameon=False, fontsize=8, ncols=2, loc="upper left", bbox_to_anchor=(0.0, 0.9))
     axes.spines[["top", "right"]].set_visible(False)
     figure.savefig(PICTURE, dpi=150)
-    for step in range(curve.shape[1]):
-        stochastic, greedy = np.round(curve[:, step, 1:].T, 3)
-        print(f"{curve[0, step, 0]:7.0f} steps: stochastic {stochastic}, greedy {greedy}")
 
 
 if __name__ == "__main__":
