@@ -251,20 +251,21 @@ def make_evaluator(env: str, kwargs: dict[str, Any] | None,
         observation, _ = envs.reset(seed=seeds)
         returns = np.zeros(len(seeds))
         state = None
-        errors: list[np.ndarray] = []
+        errors: list[np.ndarray] = []           # of scored states; some may be failed estimates
+        length = 0
         ended = False
         while not ended:
             how: Any = {"action_masks": envs.action_masks()} if isinstance(model, MaskablePPO) \
                 else {}
-            actions, state = model.predict(observation, state, np.full(len(seeds), not errors),
+            actions, state = model.predict(observation, state, np.full(len(seeds), length == 0),
                                            deterministic=True, **how)
-            observation, rewards, done, _, _ = envs.step(actions)
+            observation, rewards, done, _, info = envs.step(actions)
             returns += rewards
-            errors.append(envs.errors())
+            length += 1
+            if "error" in info:
+                errors.append(info["error"])
             ended = bool(done.all())
-        # unscored states are NaN in all episodes, failed estimates in some
-        scored = np.array([row for row in errors if not np.isnan(row).all()])
-        return scored.mean(axis=0), returns, np.full(len(seeds), len(errors))
+        return np.mean(errors, axis=0), returns, np.full(len(seeds), length)
 
     return evaluate
 

@@ -275,7 +275,7 @@ def test_exceptions_are_reported(tmp_path):
     steps = [f"if self.calls == {k}: {statement}" for k, (statement, _) in enumerate(EXCEPTIONS, 1)]
     path = write_baseline(tmp_path, update="\n        ".join(steps))
     with worker(path, KIND, limits=Limits(memory=3 << 30)) as there:
-        there.begin()
+        there(None)
         for _, message in EXCEPTIONS:
             with pytest.raises(WorkerError, match=message):
                 there.update(np.zeros(4), np.zeros(4))

@@ -177,7 +177,7 @@ def test_failed_estimates_are_in_evaluations(monkeypatch):
         def predict(self, *_, **__):
             return np.zeros(2, dtype=int), None
 
-    errors, factors = InjectionVectorEnv.errors, iter([*[[1, 1]] * 5, [1, np.nan]])
+    errors, factors = InjectionVectorEnv.errors, iter([*[[1, 1]] * 6, [1, np.nan]])
     monkeypatch.setattr(InjectionVectorEnv, "errors", lambda self: errors(self) * next(factors))
     assert list(np.isnan(training.make_evaluator(NAME, SHORT, TINY)(Still())[0])) == [False, True]
 
@@ -256,5 +256,5 @@ def test_the_command_prints_the_score_and_the_next_command(monkeypatch, tmp_path
     code, said, complaint = eitbench("train", "--env", NAME, "--config", config, "--out", tmp_path / "run")
     assert code == 0, complaint
     errors = np.load(tmp_path / "run" / "evaluations.npz")["errors"][-1]
-    assert f"ẽ_c {errors.mean():.3g} in 2 dev episodes" in said
+    assert f"ẽ_c {errors.mean():.3g}, return " in said and " in 2 dev episodes" in said
     assert f"next: eitbench run --env {NAME} --policy {tmp_path / 'run' / 'model.zip'}" in said
