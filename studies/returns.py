@@ -7,13 +7,13 @@ table of an environment's page, and `spec.reward_threshold`.
 
 import warnings
 
-import numpy as np
 import pandas as pd
 
 import eitbench
 from eitbench._files import PACKAGE
 from eitbench.bench.methods import builtin_agents, load_method
 from eitbench.bench.runner import cached_environment, is_compatible
+from eitbench.bench.text import mean_and_interval
 from eitbench.bench.tracks import Environment, builtin_ids, track_of
 from eitbench.report.tables import agent_name
 
@@ -40,7 +40,7 @@ def returns(id: str) -> pd.DataFrame:
                                        group=POLICIES.get(name, "trained agents")))
     by_policy = pd.concat(tables).groupby(["group", "policy", "seed"])["return"].mean()
     rows = by_policy.groupby(["group", "policy"]).agg(
-        mean="mean", half_width=lambda each: 1.96 * np.std(each, ddof=1) / np.sqrt(len(each)))
+        mean="mean", half_width=lambda each: mean_and_interval(list(each))[1])
     best = rows.sort_values("mean").groupby("group").tail(1).reset_index()
     order = best["group"].map(GROUPS.index)
     print(rows.sort_values("mean", ascending=False).round(3).to_string(), flush=True)

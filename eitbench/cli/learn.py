@@ -186,8 +186,8 @@ def fit_model(
     from tqdm import tqdm
 
     import eitbench
-    from eitbench.bench.text import format_number
     from eitbench.estimation import identify_model
+    from eitbench.measured.quality import percent
     with options.cli_errors():
         examples = eitbench.dataset(env, seeds)
         model = identify_model(
@@ -200,4 +200,4 @@ def fit_model(
     left = float(model.residual_covariance.trace() / examples.mass.sum())
     options.echo(f"{out}: {modes} modes of the concentration, impulse response of "
                 f"{model.impulse_response.shape[1]} steps; root mean square residual "
-                f"{format_number(100 * left**0.5)} %")
+                f"{percent(left**0.5)}")

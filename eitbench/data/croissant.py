@@ -30,7 +30,7 @@ RAI = {
                         "splits train and dev; reporting of scores on the split test.",
     "rai:dataLimitations": "One vessel, one flow model and one instrument; distributions of the "
                            "target are stated in dataset.json. Real instruments have other errors.",
-    "rai:dataBiases": "Targets are drawn from the distribution that the built-in priors assume.",
+    "rai:dataBiases": "The targets of all splits have one distribution.",
     "rai:personalSensitiveInformation": "None: no measured and no personal data."}
 
 

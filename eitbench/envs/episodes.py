@@ -26,7 +26,6 @@ from eitbench.data.seeds import warn_test_seeds
 from eitbench.worlds.task import Task, make_task
 
 if TYPE_CHECKING:
-    from eitbench.numerics.mesh import Mesh
     from eitbench.worlds.world import World
 
 Observation = dict[str, np.ndarray]
@@ -51,10 +50,21 @@ class EpisodeCore(ABC):
     action_space: spaces.Space
     """of one episode"""
 
-    def __init__(self, world: World) -> None:
+    def __init__(self, world: World, **task_options: Any) -> None:
         self.world = world
         self.seeds: tuple[int, ...] = ()
         """episodes in progress"""
+        self._task_options = task_options
+
+    @cached_property
+    def task(self) -> Task:
+        """Information for an estimator; built on first use, since steps need none of its models."""
+        return make_task(self.world, **self._task_options)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return the state of the episodes, so that a copy continues them, also in another process;
+        the models of the task are built again."""
+        return {name: value for name, value in vars(self).items() if name != "task"}
 
     def reset(self, seeds: Sequence[int],
               provide: Callable[[World, int], None] | None = None) -> None:
@@ -109,15 +119,17 @@ class EpisodeCore(ABC):
         """Return t of the last estimate of episode ``b``, the estimate (n,), its standard deviation
         (n,) if known, and the currents (L,)."""
 
-    def draw(self, b: int, task: Task) -> np.ndarray:
+    def draw(self, b: int) -> np.ndarray:
         """(height, width, 3) uint8: truth, estimate, its standard deviation, electrodes."""
         with require_extra("render()"):
             from eitbench.envs.rendering import draw_frame
+        from eitbench.data.episodes import cached_truth_model
         t, estimate, std, currents = self.picture(b)
         world = self.world
         truth = concentration_at(world, self.seeds[b], t, self.n_initial + 1)
-        return draw_frame(task, truth_mesh(world), truth, estimate, std, currents,
-                          t * world.time_step, world.region)
+        mesh = cached_truth_model(world).transport.mesh
+        return draw_frame(self.task, mesh, truth, estimate, std, currents, t * world.time_step,
+                          world.region)
 
 
 class FixedLengthEnv(gym.Env[Any, Any]):  # type: ignore[misc]
@@ -156,18 +168,11 @@ def can_render(render_mode: str | None) -> bool:
     return render_mode is not None
 
 
-def truth_mesh(world: World) -> Mesh:
-    """Return the mesh of the ground truth."""
-    from eitbench.data.episodes import cached_truth_model
-    return cached_truth_model(world).transport.mesh
-
-
 class EpisodeEnv(FixedLengthEnv):
     """One episode of a core at a time."""
 
     metadata = {"render_modes": RENDER_MODES, "render_fps": 8}  # noqa: RUF012 (gymnasium's form)
     core: EpisodeCore
-    _task_options: dict[str, Any] = {}  # noqa: RUF012 (replaced, not changed)
 
     def __init__(self, core: EpisodeCore, episodes: int | None, split: str,
                  render_mode: str | None) -> None:
@@ -183,15 +188,10 @@ class EpisodeEnv(FixedLengthEnv):
         self.action_space = core.action_space
         self._step = 0
 
-    @cached_property
+    @property
     def task(self) -> Task:
-        """Information for an estimator; built on first use, since steps need none of its models."""
-        return make_task(self.world, **self._task_options)
-
-    def __getstate__(self) -> dict[str, Any]:
-        """Return the state of the episode, so that a copy continues it, also in another process;
-        the models of the task are built again."""
-        return {name: value for name, value in vars(self).items() if name != "task"}
+        """Information for an estimator."""
+        return self.core.task
 
     def reset(self, *, seed: int | None = None,
               options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
@@ -236,11 +236,7 @@ class EpisodeEnv(FixedLengthEnv):
         if not can_render(self.render_mode):
             return None
         self.require_reset("render()")
-        return self.core.draw(0, self.task)
-
-    def truth_mesh(self) -> Mesh:
-        """Return the mesh of the ground truth."""
-        return truth_mesh(self.world)
+        return self.core.draw(0)
 
     def require_reset(self, caller: str) -> None:
         """Raise ``ResetNeeded`` before the first episode."""
@@ -259,7 +255,6 @@ class EpisodeVectorEnv(gym.vector.VectorEnv[Any, np.ndarray, np.ndarray]):
 
     metadata = {"render_modes": RENDER_MODES, "render_fps": 8,  # noqa: RUF012
                 "autoreset_mode": AutoresetMode.NEXT_STEP}
-    _task_options: dict[str, Any] = {}  # noqa: RUF012 (replaced, not changed)
 
     def __init__(self, make_core: Callable[[], EpisodeCore], num_envs: int, episodes: int | None,
                  split: str, render_mode: str | None, max_episode_steps: int | None, *,
@@ -292,18 +287,13 @@ class EpisodeVectorEnv(gym.vector.VectorEnv[Any, np.ndarray, np.ndarray]):
         self._map = self._executor.map if self._executor else map
 
     def __getstate__(self) -> dict[str, Any]:
-        """Return everything but the threads and the task: a copy makes separate ones."""
+        """Return everything but the threads: a copy has separate ones."""
         return {name: value for name, value in vars(self).items()
-                if name not in ("_executor", "_map", "task")}
+                if name not in ("_executor", "_map")}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         vars(self).update(state)
         self._start_threads()
-
-    @cached_property
-    def task(self) -> Task:
-        """Information for an estimator; built on first use."""
-        return make_task(self.world, **self._task_options)
 
     def render(self) -> tuple[np.ndarray, ...] | None:  # type: ignore[override]
         """Draw each episode as `EpisodeEnv.render` does; None without a mode."""
@@ -311,7 +301,7 @@ class EpisodeVectorEnv(gym.vector.VectorEnv[Any, np.ndarray, np.ndarray]):
             return None
         if self._step == 0:
             raise gym.error.ResetNeeded("call reset() before render()")
-        return tuple(core.draw(b, self.task) for core in self.cores for b in range(len(core.seeds)))
+        return tuple(core.draw(b) for core in self.cores for b in range(len(core.seeds)))
 
     def close_extras(self, **kwargs: Any) -> None:
         """Stop the threads."""

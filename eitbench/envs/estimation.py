@@ -47,8 +47,8 @@ class EstimationCore(EpisodeCore):
     estimate_std: np.ndarray | None = None
     """(n,) standard deviation of the last estimate in mol/m³ for images, if the caller has one"""
 
-    def __init__(self, world: World, lag: int) -> None:
-        super().__init__(world)
+    def __init__(self, world: World, lag: int, assumed: dict[str, Any]) -> None:
+        super().__init__(world, lag=lag, **assumed)
         self.lag = lag
         self.length = world.n_steps + lag
         cycle = world.currents
@@ -180,8 +180,7 @@ class EstimationEnv(EpisodeEnv):
                  assume: dict[str, Any] | None = None, episodes: int | None = None,
                  split: str = "train", render_mode: str | None = None) -> None:
         resolved, self.lag, assumed = resolve_arguments(entry(name, variant), world, lag, assume)
-        super().__init__(EstimationCore(resolved, self.lag), episodes, split, render_mode)
-        self._task_options = {"lag": self.lag, **assumed}
+        super().__init__(EstimationCore(resolved, self.lag, assumed), episodes, split, render_mode)
         self.n_nodes = self.core.n_nodes
         """nodes of the mesh of the estimates"""
 
@@ -232,9 +231,8 @@ class EstimationVectorEnv(EpisodeVectorEnv):
                  split: str = "train", render_mode: str | None = None,
                  max_episode_steps: int | None = None) -> None:
         resolved, lag, assumed = resolve_arguments(entry(name, variant), world, lag, assume)
-        super().__init__(lambda: EstimationCore(resolved, lag), num_envs, episodes, split,
+        super().__init__(lambda: EstimationCore(resolved, lag, assumed), num_envs, episodes, split,
                          render_mode, max_episode_steps)
-        self._task_options = {"lag": lag, **assumed}
 
     def _checked(self, actions: np.ndarray) -> np.ndarray:
         return check_actions(actions, self.action_space, self.cores[0].n_nodes)

@@ -65,15 +65,13 @@ def find_records(name: str, folder: Path) -> list[dict[str, Any]]:
     for place in dict.fromkeys([folder.resolve(), BUNDLED_RECORDS.resolve()]):
         there = read_records(place)
         known |= {record["method"] for record in there}
-        own = [record for record in (there if version else split_outdated(there)[0])
+        if not version:
+            there = split_outdated(there)[0]
+        own = [record for record in there
                if record["method"] == method and (not version or fits(record["version"]))]
         if not version:
-            own = [record for record in own if record["official"]] or own
-        if not own and not version:
-            trainings = [record for record in split_outdated(there)[0]
-                         if agent_name(record["method"]) == method]
-            if trainings:
-                return mean_over_trainings(trainings)
+            own = [record for record in own if record["official"]] or own or mean_over_trainings(
+                [record for record in there if agent_name(record["method"]) == method])
         versions = sorted({record["version"] for record in own})
         if len(versions) > 1:
             found = ", ".join(f"{method}@{each}" for each in versions)
@@ -99,7 +97,7 @@ def mean_over_trainings(records: list[dict[str, Any]]) -> list[dict[str, Any]]:
         episodes = [{"seed": seed, "status": "ok", "scores": column.dropna().to_dict()}
                     for seed, column in mean.items()]
         means.append(first | {"method": agent_name(first["method"]), "episodes": episodes,
-                              "version": f"mean of {len(tables)} trainings"})
+                              "version": "mean over trainings"})
     return means
 
 

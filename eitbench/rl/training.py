@@ -205,6 +205,7 @@ def train(env: str, algo: str, config: TrainingConfig, seed: int, folder: Path,
     save_model(model, made)
     write_atomically(folder / "sha256", hashlib.sha256(made.read_bytes()).hexdigest().encode())
     latest.unlink()
+    learning.close()
     (folder / "reference.npy").unlink(missing_ok=True)
     return made
 
@@ -352,14 +353,12 @@ class _Checkpoints(BaseCallback):
         row: dict[str, Any] = {"timesteps": model.num_timesteps, "results": returns,
                                "ep_lengths": lengths, "errors": errors}
         path = self.folder / "evaluations.npz"
-        table = {name: np.zeros((0, *np.shape(value)), int if name == "timesteps" else float)
-                 for name, value in row.items()}
+        rows: dict[str, Any] = {name: [value] for name, value in row.items()}
         if path.exists():
-            table = dict(np.load(path))
-        kept = table["timesteps"] < model.num_timesteps
+            table = np.load(path)
+            kept = table["timesteps"] < model.num_timesteps
+            rows = {name: [*table[name][kept], value] for name, value in row.items()}
         content = io.BytesIO()
-        rows: dict[str, Any] = {name: np.concatenate([table[name][kept], np.array([value])])
-                                for name, value in row.items()}
         np.savez(content, **rows)
         write_atomically(path, content.getvalue())
         return errors, returns

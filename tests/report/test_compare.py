@@ -66,7 +66,7 @@ def test_an_agent_is_the_mean_of_its_trainings(tmp_path):
     table = compare(find_records("ppo", tmp_path), find_records("other", tmp_path))
     assert table["a"].item() == pytest.approx(errors[:2, :7].mean()) and table["episodes"].item() == 7
     (mean,) = find_records("ppo", tmp_path)
-    assert (mean["method"], mean["version"]) == ("ppo", "mean of 2 trainings")
+    assert (mean["method"], mean["version"]) == ("ppo", "mean over trainings")
 
 
 def test_over_environments_gains_are_compared():
