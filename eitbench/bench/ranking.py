@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 
 import numpy as np
 
@@ -17,11 +17,11 @@ from eitbench.bench.statistics import (
 )
 
 
-def shared_ranks(scores: Mapping[str, Scores], unranked: Collection[str] = (), *,
+def shared_ranks(scores: Mapping[str, Scores], *,
                  statistic: Statistic = mean_over_environments, higher_is_better: bool = False,
-                 n_resamples: int = N_RESAMPLES, seed: int = 0) -> dict[str, int | None]:
-    """Rank methods that ran on the same episodes: 1 + the number of ranked methods that are
-    significantly better.
+                 n_resamples: int = N_RESAMPLES, seed: int = 0) -> dict[str, int]:
+    """Rank methods that ran on the same episodes: 1 + the number of methods that are significantly
+    better.
 
     A method is significantly better if the interval of the `paired_difference` excludes zero on the
     better side. Rank 1 means that no method is significantly better, rank 3 that two are. A method
@@ -34,8 +34,6 @@ def shared_ranks(scores: Mapping[str, Scores], unranked: Collection[str] = (), *
     ----------
     scores : method -> environment -> seed -> score
         Environments and seeds must be the same for all methods.
-    unranked : collection of str
-        Methods without a rank that do not affect the ranks of others, such as privileged ones.
     statistic : callable
         Statistic to compare and order the methods, as in `stratified_bootstrap`.
     n_resamples, seed
@@ -43,7 +41,7 @@ def shared_ranks(scores: Mapping[str, Scores], unranked: Collection[str] = (), *
 
     Returns
     -------
-    method -> rank, or None if unranked; best first by the statistic.
+    method -> rank; best first by the statistic.
 
     Raises
     ------
@@ -57,19 +55,14 @@ def shared_ranks(scores: Mapping[str, Scores], unranked: Collection[str] = (), *
     values = {method: sign * float(statistic(*map(np.sort, own)))
               for method, own in strata.items()}
     order = sorted(scores, key=lambda method: (values[method], method))
-    ranked = [method for method in order if method not in unranked]
-    ranks: dict[str, int | None] = dict.fromkeys(order)
     if not has_enough_episodes(next(iter(strata.values()))):
-        return ranks | dict.fromkeys(ranked, 1)
+        return dict.fromkeys(order, 1)
     cut = tail_percent(tuple(map(len, next(iter(strata.values())))))
     # all methods have the same resamples, so the difference of two rows is paired
     drawn = {method: sign * resample(strata[method], statistic, n_resamples, seed)
-             for method in ranked}
-    for method in ranked:
-        better = [other for other in ranked
-                  if np.percentile(drawn[method] - drawn[other], cut) > 0.0]
-        ranks[method] = 1 + len(better)
-    return ranks
+             for method in order}
+    return {method: 1 + sum(bool(np.percentile(drawn[method] - drawn[other], cut) > 0.0)
+                            for other in order) for method in order}
 
 
 def _strata(scores: Mapping[str, Scores]) -> dict[str, list[np.ndarray]]:

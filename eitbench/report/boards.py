@@ -30,6 +30,7 @@ from eitbench.bench.records import (
 )
 from eitbench.bench.scores import scores
 from eitbench.bench.statistics import (
+    Scores,
     interquartile_mean,
     mean_over_environments,
     stratified_bootstrap,
@@ -71,8 +72,14 @@ COST_COLUMNS = {
     "peak_memory": ("peak memory (MB)", "peak memory of the method's process, 10⁶ bytes"),
 }
 _RANK = ("1 + the number of methods that are significantly better (paired bootstrap, 95 %); "
-         "methods without a significant difference are tied. Naive baselines, oracles, privileged "
-         "methods and methods with missing or failed episodes are not ranked")
+         "methods without a significant difference are tied, and the trainings of an agent count "
+         "as one. Naive baselines, oracles, privileged methods and methods with missing or failed "
+         "episodes are not ranked")
+
+
+def agent_name(method: str) -> str:
+    """Return the name of an agent without its training seed."""
+    return re.sub(r"_seed\d+$", "", method)
 
 
 class MethodRow(NamedTuple):
@@ -105,6 +112,12 @@ class MethodRow(NamedTuple):
     def is_builtin(self) -> bool:
         """True for a built-in method, whose versions are numbered; false for a user's file."""
         return version_number(self.cells["version"]) is not None
+
+    @property
+    def agent(self) -> str:
+        """Key that the trainings of an agent share."""
+        name = agent_name(self.cells["method"])
+        return self.label if name == self.cells["method"] else f"{name} {self.cells['official']}"
 
     @property
     def has_no_rank(self) -> bool:
@@ -293,15 +306,26 @@ def _board(records: list[dict[str, Any]], known: Anchors, products: dict[str, fl
     zero = episode_errors(floor)
     rows = sorted((_row(record, seeds, zero, known, products) for record in records
                    if not seeds.isdisjoint(record["seeds"])), key=_sort_key)
-    ranks = shared_ranks({row.label: {environment: episode_errors(row.record)} for row in rows
-                          if ranked and not row.cells["note"]})
+    scores = {row.label: {environment: episode_errors(row.record)} for row in rows
+              if ranked and not row.cells["note"]}
     return Leaderboard(record_category(records[0]), environment, environment_title(records[0]),
-                       _with_ranks(rows, ranks))
+                       _with_ranks(rows, scores))
 
 
-def _with_ranks(rows: list[MethodRow], ranks: Mapping[str, int | None]) -> list[MethodRow]:
-    return [row._replace(cells=row.cells | {"rank": ranks.get(row.label)}, colour=i)
-            for i, row in enumerate(rows)]
+def _with_ranks(rows: list[MethodRow], scores: Mapping[str, Scores], **options: Any,
+                ) -> list[MethodRow]:
+    """Return the rows with colours and, where they have scores, ranks. All trainings of an agent
+    have the rank of their mean scores, and count as one method."""
+    trainings: dict[str, list[Scores]] = {}
+    for row in rows:
+        if row.label in scores:
+            trainings.setdefault(row.agent, []).append(scores[row.label])
+    ranks = shared_ranks({agent: {environment: {
+        seed: float(np.mean([own[environment][seed] for own in each])) for seed in first}
+        for environment, first in each[0].items()} for agent, each in trainings.items()}, **options)
+    return [row._replace(cells=row.cells | {
+        "rank": ranks[row.agent] if row.label in scores else None}, colour=i)
+        for i, row in enumerate(rows)]
 
 
 def _row(whole: dict[str, Any], seeds: set[str], zero: dict[str, float], known: Anchors,
@@ -417,9 +441,9 @@ def _aggregate(category: str, made: list[Leaderboard]) -> list[Leaderboard]:
             | {"official": all(row.cells["official"] for row in own)}))
         if not note:
             competing[label] = gains
-    ranks = shared_ranks(competing, statistic=interquartile_mean, higher_is_better=True)
     rows.sort(key=lambda row: (-row.cells["gain"], row.cells["method"], row.cells["version"]))
-    board = Leaderboard(category, ALL, "All environments", _with_ranks(rows, ranks))
+    board = Leaderboard(category, ALL, "All environments", _with_ranks(
+        rows, competing, statistic=interquartile_mean, higher_is_better=True))
     return [board] if rows else []
 
 

@@ -29,8 +29,7 @@ from eitbench.bench.statistics import (
 from eitbench.bench.table import MISSING, Cell, Table, number_cell
 from eitbench.bench.text import format_interval, scores_by_seed
 from eitbench.bench.tracks import CATEGORIES, qualified_name
-from eitbench.report.boards import is_naive_baseline, record_category, skill_scores
-from eitbench.report.tables import agent_name
+from eitbench.report.boards import agent_name, is_naive_baseline, record_category, skill_scores
 
 COMPARISON_FIELDS = ("environment", "score", "episodes", "a", "b", "advantage", "low", "high",
           "better", "better_low", "better_high")

@@ -23,6 +23,7 @@ from eitbench.report.boards import (
     COST_COLUMNS,
     Leaderboard,
     MethodRow,
+    agent_name,
     column_descriptions,
     columns,
     episode_errors,
@@ -56,22 +57,16 @@ class AgentRow(NamedTuple):
     """Trainings, the best first; empty unless there are several."""
 
 
-def agent_name(method: str) -> str:
-    """Return the name of an agent without its training seed."""
-    return re.sub(r"_seed\d+$", "", method)
-
-
 def group_by_agent(board: Leaderboard) -> list[AgentRow]:
     """Return the rows of a leaderboard in its order, training seeds of an agent grouped.
 
     Agents with at least two ranked training seeds become one row: the mean over these seeds, with
     the interval over the episodes of the seeds' mean scores.
     """
-    groups: dict[tuple[str, bool], list[MethodRow]] = {}
+    groups: dict[str, list[MethodRow]] = {}
     for row in board.rows:
-        method = row.cells["method"]
-        if agent_name(method) != method and not row.has_no_rank:
-            groups.setdefault((agent_name(method), row.cells["official"]), []).append(row)
+        if not row.has_no_rank:
+            groups.setdefault(row.agent, []).append(row)
     together = [AgentRow(_agent_mean(board, rows), rows) for rows in groups.values()
                 if sum(row.is_ranked for row in rows) > 1]
     if not together:
@@ -87,7 +82,7 @@ def _sort_key(row: MethodRow) -> tuple[bool, float]:
 
 
 def _agent_mean(board: Leaderboard, rows: list[MethodRow]) -> MethodRow:
-    """Return the line of an agent; ``last_rank`` is the worst of its trainings."""
+    """Return the line of an agent."""
     ranked = [row for row in rows if row.is_ranked]
     first, unfinished = ranked[0], len(rows) - len(ranked)
     frame = pd.DataFrame([row.cells for row in ranked])
@@ -102,8 +97,7 @@ def _agent_mean(board: Leaderboard, rows: list[MethodRow]) -> MethodRow:
         "method": agent_name(first.cells["method"]),
         "note": f"{unfinished} of {len(rows)} unfinished" if unfinished else "",
         "title": re.sub(r" trained with seed \d+$", "", first.cells["title"]),
-        "version": first.cells["version"] if frame["version"].nunique() == 1 else "",
-        "rank": frame["rank"].min(), "last_rank": frame["rank"].max()})
+        "version": first.cells["version"] if frame["version"].nunique() == 1 else ""})
 
 
 # -- cells -----------------------------------------------------------------------------------------
@@ -169,9 +163,6 @@ def _rank_cell(row: MethodRow, shared: Counter[int | None]) -> Cell:
     rank = row.cells["rank"]
     if rank is None:
         return Cell(MISSING)
-    last = row.cells.get("last_rank", rank)
-    if last > rank:
-        return Cell(f"{rank}–{last}", float(rank))
     return Cell(f"{rank}", float(rank), note="tied" if shared[rank] > 1 else "")
 
 

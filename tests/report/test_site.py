@@ -192,7 +192,7 @@ def board_of(records):
 
 
 def test_the_line_of_an_agent_is_the_mean_of_its_trainings():
-    """An agent has error, skill score, interval over episodes, and range of ranks; Markdown has each training seed."""
+    """An agent has error, skill score, interval over episodes, and one rank; Markdown has each training seed."""
     board = board_of(agents(record("ppo_seed3", [*of(0.5)[:5], None])))
     placed = group_by_agent(board)
     assert [line.row.cells["method"] for line in placed] == ["ppo", "between", "seer", "behind", "homogeneous"]
@@ -204,9 +204,10 @@ def test_the_line_of_an_agent_is_the_mean_of_its_trainings():
     same = next(row for row in board_of([*agents(), record("same", of(mean))]).rows if row.cells["method"] == "same")
     for end in ("error_low", "error_high"):
         assert row.cells[end] == pytest.approx(same.cells[end])
-    ranks = sorted(part.cells["rank"] for part in parts[:3])
+    assert [line.row.cells["rank"] for line in placed] == [1, 1, None, 3, None]  # the trainings count as one
+    assert {part.cells["rank"] for part in parts[:3]} == {1}
     first = page_table(board, "").rows[0]
-    assert first.cells[0].text == f"{ranks[0]}–{ranks[-1]}" and first.cells[1].note == "mean of 4 training seeds"
+    assert first.cells[0].text == "1" and first.cells[1].note == "mean of 4 training seeds"
     assert "each 0.110 to 0.131" in first.cells[2].note and len(first.children) == 4
     assert len(markdown_table(board).rows) == len(board.rows)
 
