@@ -85,7 +85,7 @@ class MeasuredCase:
 
     @cached_property
     def digest(self) -> str:
-        """sha256 of all entries that scores depend on, which texts are not."""
+        """sha256 of the entries that affect scores, without texts."""
         content = {"sha256": self.sha256, "beside": dict(self.auxiliary_files),
                    "truth": self.truth and self.truth["sha256"], "vessel": dict(self.vessel),
                    "withheld": WITHHELD_FRACTION, "settings": dict(self.settings)}

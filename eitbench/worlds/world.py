@@ -148,7 +148,7 @@ class Target(Protocol):
 
     def evolve(self, world: World, episodes: Sequence[EpisodeStreams], truth: Discretisation,
                tick: Callable[[int], object], last: int) -> Iterator[TruthTrajectory]:
-        """Simulate episodes up to state ``last``; results do not depend on the batch, bit by bit.
+        """Simulate episodes up to state ``last``; results are bitwise the same in any batch.
 
         ``tick(k)`` is called after k further steps of one episode.
         """
