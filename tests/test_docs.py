@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parent.parent
+sys.path.append(str(ROOT / "studies"))
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", ROOT / "CHANGELOG.md",
          ROOT / "leaderboards" / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 
@@ -40,6 +41,20 @@ def test_links_lead_somewhere(page):
         there = (page.parent / name).resolve() if name else page
         assert there.exists(), target
         assert not anchor or anchor in anchors(there), target
+
+
+@pytest.mark.parametrize("page", ["estimators", pytest.param("environments", marks=pytest.mark.slow)])
+def test_table_is_current(page):
+    """The table of a page is what `studies/document_tables.py` makes."""
+    import document_tables
+    text = (ROOT / "docs" / f"{page}.md").read_text(encoding="utf-8")
+    assert getattr(document_tables, page)() in text, "run `python studies/document_tables.py`"
+
+
+def test_each_estimator_has_a_row():
+    """The table of estimators has all built-in ones."""
+    from document_tables import ASSUMPTIONS
+    assert set(ASSUMPTIONS) == {path.stem for path in (ROOT / "baselines").glob("[!_]*.py")}
 
 
 def test_readme_is_short():
