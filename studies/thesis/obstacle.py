@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
+from eitbench.data.episodes import cached_truth_model
 from eitbench.envs.estimation import EstimationEnv
 from eitbench.numerics.fem import mass_matrix
 from eitbench.physics.transport import VelocityField
@@ -66,7 +67,7 @@ def obstacle(seeds: list[int], _jobs: int, out: Path) -> tuple[Path, str]:
 def _draw_flows(axes: np.ndarray, figure, env: EstimationEnv, world: World) -> float:
     """Draw the true and the assumed flow; return the fraction of the pipe with reversed flow."""
     pipe = world.vessel
-    mesh = env.truth_mesh()
+    mesh = cached_truth_model(env.world).transport.mesh
     real = world.flow.nominal(world, fine=True)
     assert real is not None
     velocity = real(mesh.points)
