@@ -172,7 +172,8 @@ def _disc_figure(path: Path, env: EstimationEnv, filtered: list[Estimate],
     for k, t in enumerate(SNAPSHOTS):
         pair = axes[2 * (k // half):2 * (k // half) + 2, k % half]
         disc = [(centres[t - 1], radius)]
-        _picture(pair[0], env.task, cached_truth_model(env.world).transport.mesh, truth[t - 1], scale, disc, f"truth, t = {t}")
+        _picture(pair[0], env.task, cached_truth_model(env.world).transport.mesh, truth[t - 1],
+                 scale, disc, f"truth, t = {t}")
         mappable = _picture(pair[1], env.task, env.task.mesh, filtered[t - 1].mean, scale, disc,
                             f"filter, t = {t}")
     top.colorbar(mappable, ax=axes, label="concentration / (mol/m³)", extend="both", aspect=50,
@@ -209,7 +210,8 @@ def fig7_4(seeds: list[int], _jobs: int, out: Path) -> tuple[Path, str]:
                                           * 10)
     figure = Figure(figsize=(12.4, 6.2), dpi=130, layout="constrained")
     axes = figure.subplots(2, 4, sharex=True, sharey=True)
-    _picture(axes[0, 0], env.task, cached_truth_model(env.world).transport.mesh, truth, scale, (), "target")
+    _picture(axes[0, 0], env.task, cached_truth_model(env.world).transport.mesh, truth, scale,
+             (), "target")
     panels = [(filtered[k - 1], f"filter after {k} injection{'s' * (k > 1)}")
               for k in (1, 2, 3, 4, 5, frame)]
     for ax, (values, title) in zip(axes.flat[1:],
