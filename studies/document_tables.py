@@ -4,20 +4,18 @@
 from the registered environments and leaderboards/leaderboard.csv, in half a minute.
 """
 
-import csv
-import re
 from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
+import pandas as pd
 
-import eitbench  # noqa: F401 (registers the environments)
+from eitbench.bench.table import Table, number_cell
 from eitbench.bench.tracks import builtin_ids, subtrack_of
+from eitbench.envs.episodes import EpisodeEnv
 from eitbench.physics.stationary import StationaryTransport
 
 ROOT = Path(__file__).resolve().parent.parent
-WRONG_VELOCITY = ("BiasedVelocity", "OtherVelocity", "Obstacle")
-"""Environments whose task has another velocity than the truth."""
 COLUMNS = {
     "Pipe2D": "2D", "Pipe2DFixedLag": "lag 4", "Pipe2DSmoothing": "smoothing",
     "Pipe2DBiasedVelocity": "biased", "Pipe2DObstacle": "obstacle",
@@ -61,37 +59,37 @@ ASSUMPTIONS = {
 """Built-in estimator -> assumed flow, and assumed inflow or image."""
 
 
-def short(id: str) -> str:
+def base_name(id: str) -> str:
     """Return an id without namespace and version."""
-    return id.partition("/")[2].removesuffix("-v0")
-
-
-def table(rows: list[list[str]]) -> str:
-    """Return a Markdown table; the first row is the header."""
-    lines = [rows[0], ["---"] * len(rows[0]), *rows[1:]]
-    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
-
-
-def number(x: float) -> str:
-    """Return a number with three digits, without an exponent."""
-    return f"{float(f'{x:.3g}'):g}"
+    return id.removeprefix("eitbench/").removesuffix("-v0")
 
 
 def environments() -> str:
     """Return the table of all built-in environments."""
-    rows = [["id", "subtrack", "nodes", "states (scored)", "velocity", "observation",
-             "action"]]
+    rows = []
     for id in builtin_ids():
         env = gym.make(id).unwrapped
-        task, name = env.task, short(id)
-        flow = ("at rest" if isinstance(task.transport, StationaryTransport) else
-                f"unknown ({len(task.velocity.nominal)})" if task.velocity else
-                "wrong" if name.endswith(WRONG_VELOCITY) else "true")
-        rows.append([
-            f"`{name}`", subtrack_of(env), f"{task.mesh.n_nodes:,}",
-            f"{task.n_steps} ({task.n_steps - task.warm_up})", flow,
-            space(env.observation_space), space(env.action_space)])
-    return table(rows)
+        task = env.task
+        rows.append({
+            "id": base_name(id), "subtrack": subtrack_of(env),
+            "nodes": number_cell(task.mesh.n_nodes),
+            "states (scored)": f"{task.n_steps} ({task.n_steps - task.warm_up})",
+            "velocity": velocity(env), "observation": space(env.observation_space),
+            "action": space(env.action_space)})
+    return Table.of(rows).markdown()
+
+
+def velocity(env: EpisodeEnv) -> str:
+    """Return how the velocity in the task compares with the true one."""
+    task, flow = env.task, env.world.flow
+    if isinstance(task.transport, StationaryTransport):
+        return "at rest"
+    if task.velocity is not None:
+        return f"unknown ({task.velocity.n_parameters})"
+    drawn = flow.draw(env.world, np.random.default_rng(0))
+    true = flow.nominal(env.world, False) if drawn is None else drawn(1)
+    points = task.mesh.points
+    return "true" if np.allclose(true(points), task.transport.velocity(points)) else "wrong"
 
 
 def space(of: gym.Space) -> str:
@@ -100,38 +98,32 @@ def space(of: gym.Space) -> str:
         return " + ".join(str(each.shape[0]) for each in of.values()) + " numbers"
     if isinstance(of, gym.spaces.Discrete):
         return f"{of.n} choices"
-    return f"{np.prod(of.shape):,} numbers"
-
-
-def scores() -> list[dict[str, str]]:
-    """Return the rows of the leaderboards."""
-    with open(ROOT / "leaderboards" / "leaderboard.csv", encoding="utf-8", newline="") as file:
-        return list(csv.DictReader(file))
+    return f"{np.prod(of.shape)} numbers"
 
 
 def estimators() -> str:
     """Return the table of all built-in estimators: assumptions, cost and errors."""
-    rows = {(row["method"], short(row["environment"])): row for row in scores()
-            if row["environment"] != "all"}
-    lines = [["method", "flow", "inflow or image", "ms/step", *COLUMNS.values()]]
-    for method, assumptions in ASSUMPTIONS.items():
-        own = [rows.get((method, id)) for id in COLUMNS]
-        times = [number(1e3 * float(row["seconds_per_step"])) for row in own if row]
-        lines.append([f"`{method}`", *assumptions, *(times[:1] or [""]),
-                      *(number(1e4 * float(row["error"])) if row else "" for row in own)])
-    return table(lines)
+    scores = pd.read_csv(ROOT / "leaderboards" / "leaderboard.csv")
+    scores = scores[scores["environment"] != "all"]
+    scores = scores.assign(environment=scores["environment"].map(base_name))
+    rows = []
+    for method, (flow, inflow) in ASSUMPTIONS.items():
+        own = scores[scores["method"] == method].set_index("environment").reindex(COLUMNS)
+        seconds = own["seconds_per_step"].dropna()
+        rows.append({
+            "method": method, "flow": flow, "inflow or image": inflow,
+            "ms/step": number_cell(1e3 * seconds.iloc[0] if len(seconds) else None)} | {
+            COLUMNS[id]: number_cell(1e4 * error) for id, error in own["error"].items()})
+    return Table.of(rows).markdown()
 
 
 def main() -> None:
     """Write both tables between their markers."""
     for name, made in (("environments", environments()), ("estimators", estimators())):
         path = ROOT / "docs" / f"{name}.md"
-        text, n = re.subn(r"(<!-- table -->\n).*?(\n<!-- end -->)",
-                          lambda found, made=made: found[1] + made + found[2],
-                          path.read_text(encoding="utf-8"), flags=re.DOTALL)
-        assert n == 1, path
-        path.write_text(text, encoding="utf-8")
-        print("wrote", path)
+        before, rest = path.read_text(encoding="utf-8").split("<!-- table -->\n")
+        after = rest.partition("\n<!-- end -->")[2]
+        path.write_text(f"{before}<!-- table -->\n{made}\n<!-- end -->{after}", encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -12,10 +12,10 @@ import pandas as pd
 import eitbench
 from eitbench._files import PACKAGE
 from eitbench.bench.methods import builtin_agents, load_method
+from eitbench.bench.ranking import agent_name
 from eitbench.bench.runner import cached_environment, is_compatible
 from eitbench.bench.text import mean_and_interval
 from eitbench.bench.tracks import Environment, builtin_ids, track_of
-from eitbench.report.boards import agent_name
 
 SEEDS = "dev:0-31"
 FILE = PACKAGE / "worlds" / "returns.csv"

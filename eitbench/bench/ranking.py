@@ -1,8 +1,10 @@
-"""Shared ranks, from the number of methods that are significantly better than a method."""
+"""Shared ranks, from the number of methods that are significantly better than a method, and means
+over the trainings of an agent."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import re
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -63,6 +65,17 @@ def shared_ranks(scores: Mapping[str, Scores], *,
              for method in order}
     return {method: 1 + sum(bool(np.percentile(drawn[method] - drawn[other], cut) > 0.0)
                             for other in order) for method in order}
+
+
+def agent_name(method: str) -> str:
+    """Return the name of an agent without its training seed."""
+    return re.sub(r"_seed\d+$", "", method)
+
+
+def mean_by_seed(scores: Sequence[Mapping[str, float]]) -> dict[str, float]:
+    """Return seed -> mean over the trainings of an agent, of the seeds that all of them have."""
+    return {seed: float(np.mean([own[seed] for own in scores])) for seed in scores[0]
+            if all(seed in own for own in scores)}
 
 
 def _strata(scores: Mapping[str, Scores]) -> dict[str, list[np.ndarray]]:

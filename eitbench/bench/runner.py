@@ -19,7 +19,7 @@ from eitbench.bench.methods import Method, load_method
 from eitbench.bench.scores import Outcome
 from eitbench.bench.tracks import Environment, check_track, is_measured, subtrack_of
 from eitbench.data.episode_cache import region_operators
-from eitbench.data.episodes import cached_truth_model, simulate
+from eitbench.data.episodes import simulate, truth_mesh
 from eitbench.data.seeds import allow_test_seeds
 from eitbench.envs.estimation import EstimationEnv
 from eitbench.envs.injection import InjectionEnv
@@ -197,7 +197,7 @@ class EstimatorOutput:
         return Outcome(
             env.world, sum(self.seconds) / task.n_steps, scoring.step_errors(mean, truth, mass),
             mean=mean, truth=truth, mass=mass,
-            points=cached_truth_model(env.world).transport.mesh.points, homogeneous=homogeneous,
+            points=truth_mesh(env.world).points, homogeneous=homogeneous,
             voltages_measured=self.voltages[states], voltages_predicted=computed,
             innovations=innovations, std=std, velocity=velocity)
 
@@ -226,7 +226,7 @@ def _run_policy(env: InjectionEnv, policy: Method, seed: int) -> EpisodeRun:
         n_injections=sum(bool(each.any()) for each in currents),
         mean=(interpolation @ np.array(mean).T).T, std=(interpolation @ np.array(std).T).T,
         truth=simulate(world, seed, progress=False).concentration[list(states)].astype(float),
-        mass=mass, points=cached_truth_model(world).transport.mesh.points,
+        mass=mass, points=truth_mesh(world).points,
         innovations=([each.value for each in used],
                      [each.covariance for each in used]) if used else None)
     return EpisodeRun(outcome, np.array(currents), {}, actions, total)

@@ -22,10 +22,10 @@ from eitbench.data import cache
 from eitbench.data.episodes import (
     Episode,
     cache_per_truth,
-    cached_truth_model,
     is_simulated,
     simulate,
     simulate_batch,
+    truth_mesh,
 )
 from eitbench.physics.profiles import VelocityModel
 from eitbench.worlds.instrument import Faults, Instrument
@@ -289,7 +289,7 @@ def region_file(world: World) -> cache.File:
 def score_operators(world: World) -> tuple[sp.csr_array, sp.csr_array]:
     """Return P and M over the whole vessel."""
     from eitbench.numerics.fem import mass_matrix
-    truth = cached_truth_model(world).transport.mesh
+    truth = truth_mesh(world)
     model = world.vessel.transport_mesh(fine=False)[0]
     return model.interpolation_to(truth.points), mass_matrix(truth)
 
@@ -299,7 +299,7 @@ def region_operators(world: World) -> tuple[sp.csr_array, sp.csr_array]:
     """Return P and M over the scored region."""
     interpolation, mass = score_operators(world)
     if world.region is not None:
-        mass = mass_between(cached_truth_model(world).transport.mesh, *world.region)
+        mass = mass_between(truth_mesh(world), *world.region)
     return interpolation, mass
 
 

@@ -16,6 +16,7 @@ from tqdm import tqdm
 from eitbench import _check
 from eitbench._notice import SlowTaskNotice
 from eitbench.data.cache import Key, cached, episode_key
+from eitbench.numerics.mesh import Mesh
 from eitbench.worlds.instrument import Faults
 from eitbench.worlds.random_streams import episode_streams
 from eitbench.worlds.world import Discretisation, World
@@ -94,12 +95,15 @@ def cached_truth_model(world: World) -> Discretisation:
     return world.truth_model()
 
 
+def truth_mesh(world: World) -> Mesh:
+    """Return the mesh of the ground truth."""
+    return cached_truth_model(world).transport.mesh
+
+
 def simulate_batch(world: World, seeds: Sequence[int], progress: bool = True,
                    last: int | None = None) -> Iterator[Episode]:
-    """Simulate several seeds up to the state ``last`` (default: all), bit-identical to `simulate`.
-
-    With a common flow eight episodes take the time of two.
-    """
+    """Simulate several seeds up to the state ``last`` (default: all), bit-identical to `simulate`;
+    with a common flow eight episodes take the time of two."""
     truth = cached_truth_model(world)
     label = f"simulating {world.name}, seed {', '.join(map(str, seeds))}"
     electrodes = truth.observation.cem.n_electrodes

@@ -123,13 +123,12 @@ class EpisodeCore(ABC):
         """(height, width, 3) uint8: truth, estimate, its standard deviation, electrodes."""
         with require_extra("render()"):
             from eitbench.envs.rendering import draw_frame
-        from eitbench.data.episodes import cached_truth_model
+        from eitbench.data.episodes import truth_mesh
         t, estimate, std, currents = self.picture(b)
         world = self.world
         truth = concentration_at(world, self.seeds[b], t, self.n_initial + 1)
-        mesh = cached_truth_model(world).transport.mesh
-        return draw_frame(self.task, mesh, truth, estimate, std, currents, t * world.time_step,
-                          world.region)
+        return draw_frame(self.task, truth_mesh(world), truth, estimate, std, currents,
+                          t * world.time_step, world.region)
 
 
 class FixedLengthEnv(gym.Env[Any, Any]):  # type: ignore[misc]

@@ -17,7 +17,7 @@ from eitbench.bench.isolation import choose_isolation
 from eitbench.bench.methods import Method
 from eitbench.bench.run import Job
 from eitbench.bench.tracks import Environment, subtrack_of
-from eitbench.data.episodes import cached_truth_model
+from eitbench.data.episodes import truth_mesh
 from eitbench.envs.rendering import (
     FIELD_COLORMAP,
     IDLE,
@@ -90,7 +90,7 @@ def _compared_frames(env: Any, loaded: list[Method], seed: int, at: range) -> It
     shown = [(method.title, states_at(env, method, seed, at)) for method in loaded]
     for t in at:
         truth, _, currents = shown[0][1][t]
-        fields = [("Truth", cached_truth_model(env.world).transport.mesh, truth)]
+        fields = [("Truth", truth_mesh(env.world), truth)]
         fields += [(title, env.task.mesh, states[t][1]) for title, states in shown]
         yield draw_comparison(env.task, fields, currents, t * env.task.transport.time_step)
 

@@ -19,7 +19,7 @@ import pandas as pd
 from eitbench._files import bundled_path
 from eitbench.bench import tracks
 from eitbench.bench.episode_table import read_episode_table, table_path
-from eitbench.bench.ranking import shared_ranks
+from eitbench.bench.ranking import agent_name, mean_by_seed, shared_ranks
 from eitbench.bench.records import (
     BOARDS,
     finished_at,
@@ -77,11 +77,6 @@ _RANK = ("1 + the number of methods that are significantly better (paired bootst
          "episodes are not ranked")
 
 
-def agent_name(method: str) -> str:
-    """Return the name of an agent without its training seed."""
-    return re.sub(r"_seed\d+$", "", method)
-
-
 class MethodRow(NamedTuple):
     """One method on a board."""
 
@@ -128,6 +123,12 @@ class MethodRow(NamedTuple):
     def complete(self) -> bool:
         """True if the method has finished every episode."""
         return not re.search("failed|missing", self.cells["note"])
+
+    def place(self) -> tuple[bool, float, str]:
+        """Return the key by which rows are sorted: by error or, in aggregates, by skill score."""
+        error, gain = self.cells["error"], self.cells["gain"]
+        value = error if error is not None else math.inf if gain is None else -gain
+        return not self.complete, value, self.label
 
     def interval(self, name: str) -> tuple[float, float, float]:
         """Return a score and the ends of its interval; NaN and infinite where unknown."""
@@ -255,8 +256,7 @@ def leaderboards(records: list[dict[str, Any]]) -> list[Leaderboard]:
     A leaderboard has the episodes of its naive baseline, or all if it has no baseline. Superseded
     records are left out. An aggregate, with ``environment`` `ALL`, holds the methods that have
     finished every episode of all `aggregate_environments` with a naive baseline (an official one
-    where it exists), if there are several. ``seconds_per_step`` is in ms of the fastest
-    episode, ``voltage_discrepancy`` in mV², ``peak_memory`` in 10⁶ bytes.
+    where it exists), if there are several. ``seconds_per_step`` is of the fastest episode.
     """
     for record in records:
         if record["split"] != "test":
@@ -305,7 +305,7 @@ def _board(records: list[dict[str, Any]], known: Anchors, products: dict[str, fl
     seeds = {seed for record in shown for seed in record["seeds"]}
     zero = episode_errors(floor)
     rows = sorted((_row(record, seeds, zero, known, products) for record in records
-                   if not seeds.isdisjoint(record["seeds"])), key=_sort_key)
+                   if not seeds.isdisjoint(record["seeds"])), key=MethodRow.place)
     scores = {row.label: {environment: episode_errors(row.record)} for row in rows
               if ranked and not row.cells["note"]}
     return Leaderboard(record_category(records[0]), environment, environment_title(records[0]),
@@ -320,9 +320,9 @@ def _with_ranks(rows: list[MethodRow], scores: Mapping[str, Scores], **options: 
     for row in rows:
         if row.label in scores:
             trainings.setdefault(row.agent, []).append(scores[row.label])
-    ranks = shared_ranks({agent: {environment: {
-        seed: float(np.mean([own[environment][seed] for own in each])) for seed in first}
-        for environment, first in each[0].items()} for agent, each in trainings.items()}, **options)
+    ranks = shared_ranks({agent: {
+        environment: mean_by_seed([own[environment] for own in each]) for environment in each[0]}
+        for agent, each in trainings.items()}, **options)
     return [row._replace(cells=row.cells | {
         "rank": ranks[row.agent] if row.label in scores else None}, colour=i)
         for i, row in enumerate(rows)]
@@ -354,11 +354,6 @@ def _identity_cells(record: dict[str, Any], environment: str, note: str) -> dict
     return {"class": record_category(record), "environment": environment, "note": note,
             "rank": None,
             **{name: record[name] for name in ("method", "version", "title", "official")}}
-
-
-def _sort_key(row: MethodRow) -> tuple[bool, float, str]:
-    error = row.cells["error"]
-    return not row.complete, math.inf if error is None else error, row.label
 
 
 def naive_baseline_record(records: Iterable[dict[str, Any]]) -> dict[str, Any] | None:
@@ -441,7 +436,7 @@ def _aggregate(category: str, made: list[Leaderboard]) -> list[Leaderboard]:
             | {"official": all(row.cells["official"] for row in own)}))
         if not note:
             competing[label] = gains
-    rows.sort(key=lambda row: (-row.cells["gain"], row.cells["method"], row.cells["version"]))
+    rows.sort(key=MethodRow.place)
     board = Leaderboard(category, ALL, "All environments", _with_ranks(
         rows, competing, statistic=interquartile_mean, higher_is_better=True))
     return [board] if rows else []

@@ -11,6 +11,7 @@ import pandas as pd
 
 from eitbench import _check
 from eitbench._files import bundled_path, resolve_input
+from eitbench.bench.ranking import agent_name, mean_by_seed
 from eitbench.bench.records import (
     finished_at,
     read_record,
@@ -29,7 +30,7 @@ from eitbench.bench.statistics import (
 from eitbench.bench.table import MISSING, Cell, Table, number_cell
 from eitbench.bench.text import format_interval, scores_by_seed
 from eitbench.bench.tracks import CATEGORIES, qualified_name
-from eitbench.report.boards import agent_name, is_naive_baseline, record_category, skill_scores
+from eitbench.report.boards import is_naive_baseline, record_category, skill_scores
 
 COMPARISON_FIELDS = ("environment", "score", "episodes", "a", "b", "advantage", "low", "high",
           "better", "better_low", "better_high")
@@ -88,15 +89,15 @@ def mean_over_trainings(records: list[dict[str, Any]]) -> list[dict[str, Any]]:
     for record in records:
         groups.setdefault(_environment_and_split(record), []).append(record)
     means = []
-    for first, *others in groups.values():
-        tables = [pd.DataFrame({episode["seed"]: episode["scores"] for episode in each["episodes"]
-                                if episode["status"] == "ok"}).astype(float)
-                  for each in (first, *others)]
-        mean = sum(tables[1:], tables[0]) / len(tables)             # NaN where one has no value
-        episodes = [{"seed": seed, "status": "ok", "scores": column.dropna().to_dict()}
-                    for seed, column in mean.items()]
-        means.append(first | {"method": agent_name(first["method"]), "episodes": episodes,
-                              "version": "mean over trainings"})
+    for trainings in groups.values():
+        found = {name: mean_by_seed([scores_by_seed(each, name) for each in trainings])
+                 for name in scores()}
+        episodes = [{"seed": seed, "status": "ok", "scores": {
+            name: own[seed] for name, own in found.items() if seed in own}}
+            for seed in found["error"]]
+        means.append(trainings[0] | {
+            "method": agent_name(trainings[0]["method"]), "episodes": episodes,
+            "version": "mean over trainings"})
     return means
 
 

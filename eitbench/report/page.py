@@ -20,7 +20,7 @@ from eitbench.bench.records import group_runs
 from eitbench.bench.store import EpisodeStore
 from eitbench.bench.text import seed_ranges
 from eitbench.bench.tracks import Environment
-from eitbench.data.episodes import cached_truth_model
+from eitbench.data.episodes import truth_mesh
 from eitbench.data.seeds import allow_test_seeds, parse_seeds
 from eitbench.envs.rendering import FIELD_COLORMAP, colour_range, draw_field
 from eitbench.numerics.mesh import Mesh
@@ -91,7 +91,7 @@ def _snapshots(store: EpisodeStore, board: Leaderboard) -> dict[str, Any] | None
     truth = env.truth()
     times = task.warm_up + np.linspace(0.12, 0.88, N_SNAPSHOT_TIMES) * (task.n_steps - task.warm_up)
     rows = [(f"t = {1e3 * t * task.transport.time_step:.0f} ms",
-             [_picture(task, cached_truth_model(env.world).transport.mesh, truth[t - 1]),
+             [_picture(task, truth_mesh(env.world), truth[t - 1]),
               *(_picture(task, task.mesh, field[t - 1]) for field in fields)])
             for t in np.unique(np.maximum(times.astype(int), task.warm_up + 1))]
     low, high = colour_range(task)

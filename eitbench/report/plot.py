@@ -18,7 +18,7 @@ from eitbench.bench.runner import is_compatible, iter_estimates, iter_injections
 from eitbench.bench.scores import scores
 from eitbench.bench.text import mean_and_interval
 from eitbench.data.episode_cache import region_operators
-from eitbench.data.episodes import cached_truth_model, simulate
+from eitbench.data.episodes import simulate, truth_mesh
 from eitbench.data.seeds import format_seed, parse_seeds
 from eitbench.envs.injection import InjectionEnv
 from eitbench.envs.rendering import colour_range, draw_electrodes, draw_field
@@ -98,7 +98,7 @@ def episode(method: Any, env: str | gym.Env, seed: int | str, *,
     _check.integer("times", times, low=1, high=world_of.schedule.scored_steps)
     wanted = list(map(int, np.linspace(world_of.warm_up + 1, world_of.n_steps, times + 2)[1:-1]))
     found = states_at(made, loaded, number, wanted)
-    mesh = cached_truth_model(world_of).transport.mesh
+    mesh = truth_mesh(world_of)
     interpolation, mass = region_operators(world_of)
     task = made.task
     figure, axes = plt.subplots(times, 2, figsize=_size(task, times, 2), squeeze=False,

@@ -15,6 +15,7 @@ import pandas as pd
 from markupsafe import Markup
 
 from eitbench._sanitize import escape_markdown
+from eitbench.bench.ranking import agent_name, mean_by_seed
 from eitbench.bench.table import MISSING, Cell, Table, mean_cell, number_cell
 from eitbench.bench.table import Row as TableRow
 from eitbench.bench.text import format_interval, format_number, scores_by_seed
@@ -23,7 +24,6 @@ from eitbench.report.boards import (
     COST_COLUMNS,
     Leaderboard,
     MethodRow,
-    agent_name,
     column_descriptions,
     columns,
     episode_errors,
@@ -69,16 +69,9 @@ def group_by_agent(board: Leaderboard) -> list[AgentRow]:
             groups.setdefault(row.agent, []).append(row)
     together = [AgentRow(_agent_mean(board, rows), rows) for rows in groups.values()
                 if sum(row.is_ranked for row in rows) > 1]
-    if not together:
-        return [AgentRow(row, []) for row in board.rows]
     grouped = {row.label for line in together for row in line.parts}
     together += [AgentRow(row, []) for row in board.rows if row.label not in grouped]
-    return sorted(together, key=lambda line: _sort_key(line.row))
-
-
-def _sort_key(row: MethodRow) -> tuple[bool, float]:
-    error, gain = row.cells["error"], row.cells["gain"]
-    return not row.complete, error if error is not None else math.inf if gain is None else -gain
+    return sorted(together, key=lambda line: line.row.place())
 
 
 def _agent_mean(board: Leaderboard, rows: list[MethodRow]) -> MethodRow:
@@ -89,8 +82,7 @@ def _agent_mean(board: Leaderboard, rows: list[MethodRow]) -> MethodRow:
     means = frame[[*INTERVAL_HEADINGS, *headings()]].astype(float).mean()
     cells = first.cells | means.astype(object).where(means.notna(), None).to_dict() | dict.fromkeys(
         f"{name}_{end}" for name in INTERVAL_HEADINGS for end in ("low", "high"))
-    played = pd.DataFrame([episode_errors(row.record) for row in ranked]).dropna(axis=1)
-    errors = {str(seed): float(mean) for seed, mean in played.mean().items()}
+    errors = mean_by_seed([episode_errors(row.record) for row in ranked])
     if errors:
         cells |= error_and_skill(errors, episode_errors(naive_baseline_record(board.records)))
     return first._replace(record=None, cells=cells | {
@@ -197,24 +189,20 @@ def page_table(board: Leaderboard, root: str, *, compact: bool = False) -> Table
     axes = ScoreAxes.of(board)
     together = group_by_agent(board)
     outperformed = _beaten_oracles(together)
+    shared = Counter(line.row.cells["rank"] for line in together)
 
-    def cells(row: MethodRow, parts: Sequence[MethodRow], shared: Counter[int | None],
-              ) -> dict[str, Cell]:
+    def cells(row: MethodRow, parts: Sequence[MethodRow] = ()) -> dict[str, Cell]:
         more = [*outperformed.get(row.label, ()), *author_badges(row)]
         return {"rank": _rank_cell(row, shared), "method": method_cell(row, root, parts, more),
                 **axes.cells(row, parts),
                 **_number_cells(row, INDEX_COLUMNS if compact else headings())}
 
-    of_lines = Counter(line.row.cells["rank"] for line in together)
-    of_rows = Counter(row.cells["rank"] for row in board.rows)
-    made = Table.of((cells(line.row, line.parts, of_lines) for line in together),
-                    label=board.title, keep=["rank"],
-                    flags=[filter_flags(line.row) for line in together])
-
     def part(row: MethodRow) -> TableRow:
-        own = cells(row, (), of_rows)
+        own = cells(row)
         return TableRow([own[heading] for heading in made.headings], filter_flags(row))
 
+    made = Table.of((cells(*line) for line in together), label=board.title, keep=["rank"],
+                    flags=[filter_flags(line.row) for line in together])
     return made._replace(rows=[row._replace(children=tuple(map(part, line.parts)))
                                for row, line in zip(made.rows, together, strict=True)])
 
@@ -309,8 +297,7 @@ def explanations(tables: Iterable[Table]) -> dict[str, str]:
 
 def terminal_tables(boards: Sequence[Leaderboard], characters: int) -> str:
     """Return a table of each board, at most ``characters`` wide, and notes."""
-    parts = []
-    left_out: dict[str, None] = {}
+    parts, left_out = list[str](), list[str]()
     for board in boards:
         table = run_table(board, title="method")
         table = table._replace(rows=[row._replace(cells=[
@@ -319,8 +306,8 @@ def terminal_tables(boards: Sequence[Leaderboard], characters: int) -> str:
         worse = [heading for heading in table.headings if heading.startswith("difference to ")]
         order = [*COLUMN_PRIORITY[:2], *worse, *COLUMN_PRIORITY[2:]]
         shown = table.fit_width(characters, order)
-        left_out |= dict.fromkeys(heading for heading in table.headings
-                                  if heading not in shown.headings)
+        left_out += [heading for heading in table.headings
+                     if heading not in [*shown.headings, *left_out]]
         parts.append(f"{run_title(board)}\n\n{shown.markdown()}")
     if any("†" in part for part in parts):
         parts.append("† 1 − contrast error, since the anchors of the normalised score have no\n"
@@ -385,5 +372,5 @@ def _highlighted_rows(rows: list[MethodRow]) -> list[MethodRow]:
     kinds: dict[str, MethodRow] = {}
     for row in sorted(rows, key=lambda row: row.is_builtin):
         if not row.has_no_rank:
-            kinds.setdefault(agent_name(row.cells["method"]), row)
+            kinds.setdefault(row.agent, row)
     return chosen + list(kinds.values())[:N_HIGHLIGHTED - len(chosen)]

@@ -18,7 +18,7 @@ from eitbench import scoring
 from eitbench.bench.methods import load_method
 from eitbench.bench.runner import iter_estimates
 from eitbench.data.episode_cache import score_operators
-from eitbench.data.episodes import cached_truth_model
+from eitbench.data.episodes import truth_mesh
 from eitbench.envs.estimation import EstimationEnv
 from eitbench.envs.rendering import STD_COLORMAP, colour_range, draw_electrodes, draw_field
 from eitbench.numerics.mesh import Mesh
@@ -98,7 +98,7 @@ def draw_fields(env: EstimationEnv, axes: np.ndarray, times: list[int],
     truth = env.truth()
     (low, high) = colour_range(env.task)
     for row, t in zip(axes, times, strict=True):
-        fields = [(cached_truth_model(env.world).transport.mesh, truth[t - 1])]
+        fields = [(truth_mesh(env.world), truth[t - 1])]
         fields += [(env.task.mesh, estimates[t - 1].mean) for estimates in columns]
         for ax, (mesh, values) in zip(row, fields, strict=True):
             mappable = draw_field(ax, mesh, values, low, high)

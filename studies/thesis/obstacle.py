@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
-from eitbench.data.episodes import cached_truth_model
+from eitbench.data.episodes import truth_mesh
 from eitbench.envs.estimation import EstimationEnv
 from eitbench.numerics.fem import mass_matrix
 from eitbench.physics.transport import VelocityField
@@ -67,7 +67,7 @@ def obstacle(seeds: list[int], _jobs: int, out: Path) -> tuple[Path, str]:
 def _draw_flows(axes: np.ndarray, figure, env: EstimationEnv, world: World) -> float:
     """Draw the true and the assumed flow; return the fraction of the pipe with reversed flow."""
     pipe = world.vessel
-    mesh = cached_truth_model(env.world).transport.mesh
+    mesh = truth_mesh(env.world)
     real = world.flow.nominal(world, fine=True)
     assert real is not None
     velocity = real(mesh.points)

@@ -14,7 +14,7 @@ from eitbench.bench.methods import load_method
 from eitbench.bench.runner import run_estimator
 from eitbench.bench.scores import compute_scores
 from eitbench.data.episode_cache import score_operators
-from eitbench.data.episodes import cached_truth_model
+from eitbench.data.episodes import truth_mesh
 from eitbench.envs.estimation import EstimationEnv
 from eitbench.envs.rendering import STD_COLORMAP, colour_range, draw_field
 
@@ -103,7 +103,7 @@ def fig5_6(seeds: list[int], _jobs: int, out: Path) -> tuple[Path, str]:
     averages = []
     for row, start in zip(axes, starts, strict=True):
         averages.append(truth[start:start + frame].mean(axis=0))
-        draw_field(row[0], cached_truth_model(env.world).transport.mesh, averages[-1], low, high)
+        draw_field(row[0], truth_mesh(env.world), averages[-1], low, high)
         mappable = draw_field(row[1], env.task.mesh, images[start].mean, low, high)
         for ax in row:
             draw_idle_electrodes(ax, env.task)

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from matplotlib.figure import Figure
 
-from eitbench.data.episodes import cached_truth_model
+from eitbench.data.episodes import truth_mesh
 from eitbench.envs.estimation import EstimationEnv
 from eitbench.envs.isosurface import draw_isosurfaces
 from eitbench.envs.rendering import colour_range, draw_field
@@ -38,7 +38,7 @@ def fig5_10(seeds: list[int], _jobs: int, out: Path) -> tuple[Path, str]:
     figure = Figure(figsize=(17.0, 4.9), dpi=120, layout="constrained")
     axes = figure.subplots(len(times), 6)
     for number, (row, t) in enumerate(zip(axes, times, strict=True), start=1):
-        fields = [(cached_truth_model(env.world).transport.mesh, truth[t - 1]),
+        fields = [(truth_mesh(env.world), truth[t - 1]),
                   (env.task.mesh, filtered[t - 1].mean),
                   (env.task.mesh, smoothed[t - 1].mean)]
         for k, (mesh, values) in enumerate(fields):

@@ -11,7 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 
-from eitbench.data.episodes import cached_truth_model
+from eitbench.data.episodes import truth_mesh
 from eitbench.envs.estimation import EstimationEnv
 from eitbench.envs.rendering import draw_field
 from eitbench.estimation import CalibrationFrame
@@ -172,7 +172,7 @@ def _disc_figure(path: Path, env: EstimationEnv, filtered: list[Estimate],
     for k, t in enumerate(SNAPSHOTS):
         pair = axes[2 * (k // half):2 * (k // half) + 2, k % half]
         disc = [(centres[t - 1], radius)]
-        _picture(pair[0], env.task, cached_truth_model(env.world).transport.mesh, truth[t - 1],
+        _picture(pair[0], env.task, truth_mesh(env.world), truth[t - 1],
                  scale, disc, f"truth, t = {t}")
         mappable = _picture(pair[1], env.task, env.task.mesh, filtered[t - 1].mean, scale, disc,
                             f"filter, t = {t}")
@@ -210,7 +210,7 @@ def fig7_4(seeds: list[int], _jobs: int, out: Path) -> tuple[Path, str]:
                                           * 10)
     figure = Figure(figsize=(12.4, 6.2), dpi=130, layout="constrained")
     axes = figure.subplots(2, 4, sharex=True, sharey=True)
-    _picture(axes[0, 0], env.task, cached_truth_model(env.world).transport.mesh, truth, scale,
+    _picture(axes[0, 0], env.task, truth_mesh(env.world), truth, scale,
              (), "target")
     panels = [(filtered[k - 1], f"filter after {k} injection{'s' * (k > 1)}")
               for k in (1, 2, 3, 4, 5, frame)]

@@ -15,7 +15,7 @@ from eitbench.bench.runner import EstimatorOutput, run_estimator
 from eitbench.bench.store import EpisodeStore
 from eitbench.bench.tracks import Environment, subtrack_of
 from eitbench.data.cache import CACHE_VARIABLE
-from eitbench.data.episodes import cached_truth_model, simulate
+from eitbench.data.episodes import simulate, truth_mesh
 from eitbench.worlds.catalogue import PIPE_2D
 from eitbench.worlds.task import Estimate, Task
 from scipy.optimize import minimize_scalar
@@ -242,7 +242,7 @@ def test_scores_can_be_recomputed_from_what_is_stored(tilted):
     """Relative and contrast error are recomputed from the stored estimates and the simulated truth, by other code."""
     result, means, episode = tilted
     env = FILTER.make()
-    mesh, truth = cached_truth_model(env.world).transport.mesh, episode.concentration[1:].astype(float)
+    mesh, truth = truth_mesh(env.world), episode.concentration[1:].astype(float)
     error = squared(mesh, interpolated(env.task.mesh, means, mesh.points) - truth)[2:]
     steps = error / squared(mesh, truth)[2:]
     np.testing.assert_allclose(result["step_errors"], steps, rtol=1e-9)

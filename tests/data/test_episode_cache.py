@@ -20,7 +20,7 @@ from eitbench.data.episode_cache import (
     scoring_constants,
     step_error,
 )
-from eitbench.data.episodes import cached_truth_model, simulate
+from eitbench.data.episodes import simulate, truth_mesh
 from eitbench.worlds import entry
 
 from recorded import bits
@@ -55,7 +55,7 @@ def integral_of_square(mesh, nodal):
 @pytest.fixture(scope="module")
 def to_truth():
     """Return the dense interpolation from the model's nodes to the truth's."""
-    return values_at(cached_truth_model(TINY).transport.mesh.points, TINY.estimator_model().transport.mesh)
+    return values_at(truth_mesh(TINY).points, TINY.estimator_model().transport.mesh)
 
 
 @pytest.mark.parametrize("kind", ["near the truth", "good", "bad", "constant", "background"])
@@ -65,7 +65,7 @@ def test_score_is_the_integral_over_the_truth(kind, episode, to_truth):
     The relative tolerance is 1e-6, plus 3e-10 for the single precision of the moments (measured: 6e-11).
     """
     exactly = {"rtol": 1e-6, "atol": 3e-10}
-    mesh, nodes = cached_truth_model(TINY).transport.mesh, TINY.estimator_model().transport.mesh.points
+    mesh, nodes = truth_mesh(TINY), TINY.estimator_model().transport.mesh.points
     truth = episode.concentration[1:].astype(float)
     nearest, rng = truth @ mesh.interpolation_to(nodes).T, np.random.default_rng(1)
     estimate = {"near the truth": nearest,
@@ -87,7 +87,7 @@ def test_score_is_the_integral_over_the_truth(kind, episode, to_truth):
 
 def test_outline_holds_one_triangle_of_the_mass_on_the_estimators_nodes(to_truth):
     """xᵀ·mass·x = ∫(Px)² over the truth's triangles for any x, and nothing is stored below the diagonal."""
-    mass, mesh = scoring_constants(TINY).mass, cached_truth_model(TINY).transport.mesh
+    mass, mesh = scoring_constants(TINY).mass, truth_mesh(TINY)
     assert mass.shape == (1701, 1701) and sp.tril(mass, -1).nnz == 0 and sp.triu(mass, 1).nnz > 1701
     for x in np.random.default_rng(2).normal(size=(5, 1701)):
         assert x @ (mass @ x) == pytest.approx(integral_of_square(mesh, to_truth @ x), rel=1e-12)

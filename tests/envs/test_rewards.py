@@ -8,7 +8,7 @@ from eitbench import Estimate, scoring
 from eitbench.bench.runner import run_estimator
 from eitbench.bench.scores import compute_scores
 from eitbench.data.episode_cache import score_operators
-from eitbench.data.episodes import cached_truth_model
+from eitbench.data.episodes import truth_mesh
 from estimation_envs import KINDS, PIPE, SKEWED, UNKNOWN, best_velocity, make
 
 
@@ -30,7 +30,7 @@ def test_reward_is_minus_the_relative_error_of_the_requested_state(name):
     np.testing.assert_array_equal(env.action_space.high, bound)
     np.testing.assert_array_equal(env.action_space.low, -bound)
     to_truth, mass = score_operators(base.world)
-    to_model = cached_truth_model(base.world).transport.mesh.interpolation_to(task.mesh.points)
+    to_model = truth_mesh(base.world).interpolation_to(task.mesh.points)
     flow = best_velocity(base)
     scored = 0
     for i in range(1, task.n_steps + task.lag + 1):

@@ -11,7 +11,7 @@ import pytest
 from eitbench.bench.methods import load_method
 from eitbench.bench.text import seed_ranges
 from eitbench.data.cache import CACHE_VARIABLE
-from eitbench.data.episodes import cached_truth_model
+from eitbench.data.episodes import truth_mesh
 from eitbench.data.seeds import format_seed
 from eitbench.envs.estimation import EstimationEnv
 from eitbench.estimation import CalibrationFrame, initial_covariance
@@ -51,7 +51,7 @@ def perfect(env, name, seed):
     task = env.task
     if name in ("homogeneous", "gauss_newton"):
         return constant(env, name, seed)
-    states = cached_truth_model(env.world).transport.mesh.interpolation_to(task.mesh.points) @ env.truth().T
+    states = truth_mesh(env.world).interpolation_to(task.mesh.points) @ env.truth().T
     if isinstance(task.transport, StationaryTransport):    # the cylinders need one maximum each
         smooth = initial_covariance(task.mesh, task.prior)
         states = 30.0 + smooth @ (states - 30.0) / smooth.sum(axis=1, keepdims=True)
