@@ -1,8 +1,8 @@
 """Returns of policies in the injection environments, with the reduced filter of training.
 
-`python studies/returns.py` runs the policies of each group and the trained agents on dev:0-31 in
-twenty minutes on two cores, and writes the best of each group to eitbench/worlds/returns.csv: the
-table of an environment's page, and `spec.reward_threshold`.
+`python studies/returns.py` runs all built-in policies without privileged information and the
+trained agents on dev:0-31 on two cores, and writes the best of each group to
+eitbench/worlds/returns.csv: the table of an environment's page, and `spec.reward_threshold`.
 """
 
 import warnings
@@ -11,7 +11,7 @@ import pandas as pd
 
 import eitbench
 from eitbench._files import PACKAGE
-from eitbench.bench.methods import builtin_agents, load_method
+from eitbench.bench.methods import builtin_agents, builtin_methods, load_method
 from eitbench.bench.ranking import agent_name
 from eitbench.bench.runner import cached_environment, is_compatible
 from eitbench.bench.text import mean_and_interval
@@ -19,11 +19,8 @@ from eitbench.bench.tracks import Environment, builtin_ids, track_of
 
 SEEDS = "dev:0-31"
 FILE = PACKAGE / "worlds" / "returns.csv"
-POLICIES = {
-    "random_pair": "random", "best_pair": "open loop", "best_cycle": "open loop",
-    "best_currents": "open loop", "greedy_a": "adaptive", "fault_aware": "adaptive",
-    "event_triggered": "adaptive"}
-"""Policy -> its group."""
+OPEN_LOOP = ("adjacent", "opposite", "transverse", "schedule", "best_pair", "best_cycle",
+             "best_currents")
 GROUPS = ("random", "open loop", "adaptive", "trained agents")
 
 
@@ -32,18 +29,21 @@ def returns(id: str) -> pd.DataFrame:
     each group; agents that differ in their training seed are averaged."""
     env = cached_environment(Environment(id, '{"estimator": "reduced"}'))
     tables = []
-    for name in [*POLICIES, *builtin_agents(id)]:
+    agents = builtin_agents(id)
+    for name in [*builtin_methods("injection"), *agents]:
         method = load_method(name, "injection")
-        if is_compatible(method, env):
-            table = eitbench.evaluate(name, id, SEEDS, estimator="reduced", n_jobs=2)
-            tables.append(table.assign(policy=agent_name(method.name),
-                                       group=POLICIES.get(name, "trained agents")))
+        if method.privileged or not is_compatible(method, env):
+            continue
+        group = ("random" if name == "random_pair" else "open loop" if name in OPEN_LOOP
+                 else "trained agents" if name in agents else "adaptive")
+        table = eitbench.evaluate(name, id, SEEDS, estimator="reduced", n_jobs=2)
+        tables.append(table.assign(policy=agent_name(method.name), group=group))
+        print(id, method.name, round(table["return"].mean(), 4), flush=True)
     by_policy = pd.concat(tables).groupby(["group", "policy", "seed"])["return"].mean()
     rows = by_policy.groupby(["group", "policy"]).agg(
         mean="mean", half_width=lambda each: mean_and_interval(list(each))[1])
     best = rows.sort_values("mean").groupby("group").tail(1).reset_index()
     order = best["group"].map(GROUPS.index)
-    print(rows.sort_values("mean", ascending=False).round(3).to_string(), flush=True)
     return best.iloc[order.argsort()].assign(environment=id)
 
 

@@ -33,9 +33,9 @@ KEY_DESCRIPTIONS = {
 """Meaning of each entry of an observation."""
 
 RETURNS_TEXT = """
-Mean sum of rewards in the episodes dev:0–31 with the reduced filter, that is
-`gym.make(id, split="dev")`, ± half its 95 % interval. `spec.reward_threshold` is the return of the
-best open-loop or adaptive policy. Made by `python studies/returns.py`.
+Mean sum of rewards in the episodes dev:0–31 with the reduced filter, ± half its 95 % interval, of
+the best built-in policy of each group. `spec.reward_threshold` is the largest return without
+training. Made by `python studies/returns.py`.
 """
 
 
