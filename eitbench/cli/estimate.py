@@ -70,7 +70,11 @@ def estimate(
         runs = []
         for name in baseline:
             kept = plotted_steps(env) if arrays is None else None
-            run = run_on_measurements(env, name, seed, kept=kept)
+            try:
+                run = run_on_measurements(env, name, seed, kept=kept)
+            except Exception as error:
+                raise ValueError(f"{name} failed on these measurements: "
+                                 f"{type(error).__name__}: {error}") from error
             runs.append(run)
             score = ("no measurement is withheld, so nothing is scored" if not env.withheld
                      else f"withheld RMSE {run.withheld_rmse:.2f} noise std, "
@@ -107,6 +111,8 @@ def _steps(span: str) -> slice:
     first, colon, last = span.partition(":")
     if not (colon and first.isdigit() and (last.isdigit() or not last)):
         raise ValueError(f"--span must be two numbers such as 0:800, got {span!r}")
+    if last and int(last) <= int(first):
+        raise ValueError(f"--span must end after it begins, got {span!r}")
     return slice(int(first), int(last) if last else None)
 
 

@@ -102,7 +102,7 @@ class MeasuredEnv(FixedLengthEnv):
         measurements = file if isinstance(file, Measurements) else read(file)
         self.vessel = vessel if isinstance(vessel, VesselConfig) else read_vessel(vessel)
         self.case: MeasuredCase | None = None
-        spikes = quality.find_spikes(measurements)
+        spikes = quality.find_spikes(measurements.voltages, measurements.injection_index)
         self._warnings = quality.spike_warnings(measurements, spikes)
         if spikes.any():
             measurements = replace(measurements,

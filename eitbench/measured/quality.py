@@ -43,26 +43,26 @@ def percent(fraction: float) -> str:
     return f"{100 * fraction:.2g} %" if fraction < 0.995 else f"{100 * fraction:.0f} %"
 
 
-def find_spikes(measurements: Measurements) -> np.ndarray:
-    """Return (T, M) bool: single voltages that differ by far from the same channel's voltages in
-    the uses of the injection before and after."""
-    spikes = np.zeros(measurements.voltages.shape, dtype=bool)
-    for k in np.unique(measurements.injection_index):
-        uses = np.flatnonzero(measurements.injection_index == k)
+def find_spikes(voltages: np.ndarray, injection_index: np.ndarray) -> np.ndarray:
+    """Return (T, M) bool: single ``voltages`` (T, M) that differ by far from the same channel's
+    voltages in the uses of the injection before and after."""
+    spikes = np.zeros(voltages.shape, dtype=bool)
+    for k in np.unique(injection_index):
+        uses = np.flatnonzero(injection_index == k)
         if len(uses) < SPIKE_WINDOW:
             continue
-        sample = measurements.voltages[uses[::-(-len(uses) // SPIKE_CHUNK)]]
+        sample = voltages[uses[::-(-len(uses) // SPIKE_CHUNK)]]
         size = np.sqrt(np.nanmean(np.nanmedian(sample, axis=0)**2))
         starts = np.clip(np.arange(len(uses)) - SPIKE_WINDOW // 2, 0, len(uses) - SPIKE_WINDOW)
         for begin in range(0, len(uses), SPIKE_CHUNK):        # large files stay on disk
             chunk = slice(begin, begin + SPIKE_CHUNK)
             first, last = starts[chunk][0], starts[chunk][-1] + SPIKE_WINDOW
-            windows = sliding_window_view(measurements.voltages[uses[first:last]], SPIKE_WINDOW,
+            windows = sliding_window_view(voltages[uses[first:last]], SPIKE_WINDOW,
                                           axis=0)[starts[chunk] - first]  # (uses, M, window)
             typical = np.median(windows, axis=2)               # NaN where a voltage is missing
             deviations = np.sort(np.abs(windows - typical[..., None]), axis=2)
             with np.errstate(invalid="ignore"):
-                own = np.abs(measurements.voltages[uses[chunk]] - typical)
+                own = np.abs(voltages[uses[chunk]] - typical)
                 spikes[uses[chunk]] = ((own > SPIKE_SIZE * size) & (own == deviations[..., -1])
                                        & (own > SPIKE_RATIO * deviations[..., -2]))
     return spikes
@@ -77,7 +77,8 @@ def spike_warnings(measurements: Measurements, spikes: np.ndarray) -> list[str]:
              f"{measurements.injection_index[t] + 1}, channel {m + 1} "
              f"({measurements.voltages[t, m]:.3g} V)" for t, m in found[:N_NAMED_SPIKES]]
     more = f" and {len(found) - N_NAMED_SPIKES} more" if len(found) > N_NAMED_SPIKES else ""
-    return [f"{len(found)} of {spikes.size} measurements are spikes and are left out: "
+    kind = "is a spike and is" if len(found) == 1 else "are spikes and are"
+    return [f"{len(found)} of {spikes.size} measurements {kind} left out: "
             f"{'; '.join(named)}{more}."]
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import re
+import warnings
 from collections.abc import Callable
 from dataclasses import replace
 from datetime import datetime
@@ -17,6 +18,7 @@ from eitbench import _check
 from eitbench._extras import require_extra
 from eitbench.measured.matlab import load_variables, provenance, read_eidors, read_ktc
 from eitbench.measured.measurements import Measurements
+from eitbench.measured.quality import find_spikes
 
 TIME, LOWEST, HIGHEST, COUNT, AMPLITUDE, MODE = 3, 4, 5, 7, 8, 13
 """Header lines of Sciospec files, from 0: time of the frame, lowest and highest frequency in Hz,
@@ -25,6 +27,8 @@ CHANNELS = "MeasurementChannels:"
 TIMESTAMP_FORMATS = ("%Y.%m.%d. %H:%M:%S.%f", "%Y.%m.%d. %H:%M:%S")
 SINGLE_ENDED, DIFFERENTIAL = "1", "2"
 """Measurement modes: potentials to ground, or differences of neighbouring channels."""
+EXPONENT = re.compile(r"[-+]?\d+(\.\d*)?[eE][-+]?\d+")
+"""Number such as 2e-3, which is text in YAML 1.1."""
 TABLE_VOLTAGES = ("potentials", "neighbours")
 DIFFERENCE_TITLE = re.compile(r".*\d\s*[-–]\s*\D*\d+\s*")
 """Title of a column such as ``U1-U2``."""
@@ -100,7 +104,7 @@ def read_sciospec(path: Path, *, frequency: float | None = None) -> Measurements
     if is_differential:
         matrix -= np.roll(matrix, 1, axis=1)
     else:
-        voltages -= voltages.mean(axis=2, keepdims=True)
+        voltages = _relative_to_mean(voltages.reshape(-1, L), np.tile(np.arange(K), len(files)))
     frame_time = float(np.median(np.diff(starts))) if len(files) > 1 else 1.0
     times = np.subtract(starts, starts[0])[:, None] + frame_time / K * np.arange(K)
     digest = hashlib.sha256(b"".join(file.read_bytes() for file in files)).hexdigest()
@@ -113,6 +117,23 @@ def read_sciospec(path: Path, *, frequency: float | None = None) -> Measurements
         matrix, voltages.reshape(-1, L), times.ravel(),
         source={"file": name, "sha256": digest, "frames": len(files), "frequency": hertz,
                 "assumed": f"real parts, {kind}; amplitude in A"})
+
+
+def _relative_to_mean(potentials: np.ndarray, index: np.ndarray) -> np.ndarray:
+    """Return potentials (T, L) relative to the mean of all electrodes, for injections ``index``.
+
+    A missing potential, or a spike, enters the mean with the electrode's median in the uses of the
+    injection; an electrode without any is left out of the mean.
+    """
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)             # rows and columns of NaN
+        potentials = potentials - np.nanmedian(potentials, axis=1, keepdims=True)
+        known = np.where(find_spikes(potentials, index), np.nan, potentials)
+        for k in np.unique(index):
+            typical = np.nanmedian(known[index == k], axis=0)
+            change = np.nanmean(known[index == k] - typical, axis=1, keepdims=True)
+            potentials[index == k] -= change + np.nanmean(typical)
+    return potentials
 
 
 def _pair_currents(pairs: np.ndarray, current: float, L: int) -> np.ndarray:
@@ -213,6 +234,7 @@ def read_table(path: Path, *, electrodes: int, current: float, time_step: float 
     L = _check.integer("electrodes", electrodes, low=2)
     _check.number("current", current, low=0.0, open_low=True, units="A")
     _check.number("time_step", time_step, low=0.0, open_low=True, units="s")
+    _check.number("unit", unit, low=0.0, open_low=True, units="V")
     R = _check.integer("reference_rows", reference_rows, low=0)
     pairs, voltages, titles = _read_rows(path, L, decimal, separator)
     if readings is None:
@@ -223,9 +245,8 @@ def read_table(path: Path, *, electrodes: int, current: float, time_step: float 
     if readings == "neighbours":
         matrix -= np.roll(matrix, 1, axis=1)
     else:
-        finite = np.isfinite(voltages)
-        count = np.maximum(finite.sum(axis=1, keepdims=True), 1)
-        voltages -= np.where(finite, voltages, 0.0).sum(axis=1, keepdims=True) / count
+        index = np.unique(pairs, axis=0, return_inverse=True)[1].reshape(-1)
+        voltages = _relative_to_mean(voltages, index)
     currents = _pair_currents(pairs, current, L)
     source = provenance(path, assumed=f"{current:g} A, voltages in {unit:g} V")
     measurements = Measurements.from_sequence(
@@ -310,7 +331,8 @@ def load_yaml(path: Path, subject: str) -> dict[str, Any]:
         raise ValueError(f"{subject} must be a YAML file, got {path}: {error}") from None
     if not isinstance(content, dict):
         raise ValueError(f"{subject} must be a YAML file of entries like 'name: value', got {path}")
-    return content
+    return {name: float(value) if isinstance(value, str) and EXPONENT.fullmatch(value) else value
+            for name, value in content.items()}
 
 
 READERS: dict[str, Callable[..., Measurements]] = {

@@ -230,7 +230,7 @@ def test_a_spike_is_named_and_left_out(measurements, frame):
 
 
 def test_moving_targets_have_no_spikes(measurements):
-    assert not find_spikes(measurements).any()
+    assert not find_spikes(measurements.voltages, measurements.injection_index).any()
 
 
 def test_a_frame_is_not_scored_by_itself():

@@ -113,6 +113,37 @@ def test_table(tmp_path):
     np.testing.assert_array_equal(same.voltages, measurements.voltages)
 
 
+def test_a_lost_potential_or_a_spike_does_not_shift_the_others(tmp_path):
+    """Potentials are relative to the mean of all electrodes, also where one is missing, in a drifting instrument."""
+    frames = np.concatenate([VALUES + drift for drift in (0.0, 3.0, -2.0, 0.5, 1.0, -40.0, 0.2)])
+    expected = np.tile(VALUES - VALUES.mean(axis=1, keepdims=True), (7, 1))
+    pairs = np.tile(np.stack([np.arange(8), (np.arange(8) + 1) % 8], axis=1) + 1, (7, 1))
+
+    def read_rows(values):
+        texts = np.where(np.isnan(values), "", values.astype(str))
+        rows = [",".join([*map(str, pair), *row]) for pair, row in zip(pairs, texts, strict=True)]
+        (tmp_path / "rows.csv").write_text("\n".join(rows), encoding="utf-8")
+        return read(tmp_path / "rows.csv", electrodes=8, current=1.0).voltages
+
+    np.testing.assert_allclose(read_rows(frames), expected, atol=1e-12)
+    damaged, kept = frames.copy(), np.ones(frames.shape, dtype=bool)
+    damaged[17, 1], damaged[30, 4] = np.nan, 100.0 * np.abs(VALUES).max()   # the first at an injecting electrode
+    kept[[17, 30], [1, 4]] = False
+    found = read_rows(damaged)
+    np.testing.assert_allclose(found[kept], expected[kept], atol=1e-12)
+    assert np.isnan(found[17, 1]) and found[30, 4] > 50.0 * np.abs(VALUES).max()
+
+
+def test_numbers_of_a_description(tmp_path):
+    """2e-3, which is text in YAML, is a number; a unit must be a number in V."""
+    table(tmp_path / "tank.csv")
+    (tmp_path / "tank.yml").write_text("electrodes: 8\ncurrent: 2e-3\n", encoding="utf-8")
+    np.testing.assert_allclose(read(tmp_path / "tank.csv").currents, 2.0 * CURRENTS)
+    (tmp_path / "tank.yml").write_text("electrodes: 8\ncurrent: 2e-3\nunit: mV\n", encoding="utf-8")
+    with pytest.raises(ValueError, match=r"unit must be a number in V.*got 'mV'"):
+        read(tmp_path / "tank.csv")
+
+
 @pytest.mark.parametrize(("options", "message"), [
     ({}, r"described by a YAML file.*comma\.yml"),
     ({"electrodes": 8, "current": 1e-3}, "numbers with the decimal point '.'"),
