@@ -338,6 +338,8 @@ class Worker:
             check_out_of_reach(cache_folder(), "the cache folder")
             models = cache_folder() / model_key("", None, 0).folder         # holds no episode
             files = {"/tmp/cache/models": str(models.absolute())}
+            # a relative path is relative to the worker's folder /tmp
+            files |= {str("/tmp" / path): str(path.absolute()) for path in self._meshes}
             command = [*bubblewrap(self._limits, files), *command]
         self._folder = tempfile.TemporaryDirectory(prefix="eitbench-", ignore_cleanup_errors=True)
         self._home = Path("/tmp" if self._is_confined else self._folder.name)
@@ -346,7 +348,7 @@ class Worker:
         with theirs:
             self._process = subprocess.Popen(
                 command, stdin=theirs.fileno(), stdout=theirs.fileno(), stderr=subprocess.DEVNULL,
-                start_new_session=True, env=self._environment(), cwd="/")
+                start_new_session=True, env=self._environment(), cwd=Path.cwd())
         _started.append(self)
         self._left_s, self._left_chars = EPISODE_TIMEOUT_S, MAX_OUTPUT_CHARS
         try:
@@ -413,6 +415,8 @@ class Worker:
         """Return the name of the method, the contents of its files, and the registry entry of an
         environment that was registered at run time."""
         by_hand = [each for each in runtime_entries() if each.id == id]
+        self._meshes = [Path(file) for each in by_hand
+                        for file in getattr(each.world.vessel, "files", ())]
         contents = {"entry": b"".join(map(cloudpickle.dumps, by_hand))}
         if is_path(method) and is_builtin(method):
             method = str(Path(method).resolve())

@@ -361,8 +361,16 @@ class MeshVessel:
         if missing := [f"electrode {number}" for number in numbers if number not in numbered]:
             raise ValueError(f"{self._file(fine)[0]}: must have a group for each electrode, got "
                              f"none for {', '.join(missing)}; there are {', '.join(groups)}")
+        if len(numbered) > self.n_electrodes:
+            raise ValueError(f"n_electrodes must be {len(numbered)}, the number of electrode groups "
+                             f"in {self._file(fine)[0]}, got {self.n_electrodes}")
         electrodes = [numbered[number] for number in numbers]
         return CompleteElectrodeModel(mesh, electrodes, self.contact_impedance)
+
+    @property
+    def files(self) -> tuple[str, str]:
+        """Paths of the meshes, which a confined method may read."""
+        return self.truth_mesh_file, self.model_mesh_file
 
     def _file(self, fine: bool) -> tuple[str, str]:
         if fine:

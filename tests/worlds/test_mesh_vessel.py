@@ -1,10 +1,16 @@
 """A vessel from mesh files: the same physics as a built-in vessel, and errors for missing groups."""
 
 import hashlib
+import sys
+from contextlib import closing
+from dataclasses import replace
+from pathlib import Path
 
+import cloudpickle
 import gymnasium as gym
 import numpy as np
 import pytest
+from eitbench.bench.isolation import Worker, bubblewrap_problem
 from eitbench.numerics.round_meshes import electrode_disc
 from eitbench.physics.cem import CompleteElectrodeModel
 from eitbench.worlds import World, register
@@ -15,6 +21,7 @@ from eitbench.worlds.vessels import MeshVessel, RoundTank
 
 from shapes import write_mesh
 from short import register_apart
+from tiny import write_baseline
 
 TANK = RoundTank(n_electrodes=8)
 
@@ -83,11 +90,31 @@ def test_a_world_with_it_runs(vessel, monkeypatch):
     gym.registry.pop("test/Meshed-v0")
 
 
+@pytest.mark.parametrize("kind", [
+    "process", pytest.param("bubblewrap", marks=pytest.mark.skipif(bool(bubblewrap_problem()), reason="bubblewrap"))])
+def test_an_isolated_method_has_the_meshes(kind, files, vessel, monkeypatch, tmp_path):
+    """Paths relative to the working directory are found in both kinds of isolation."""
+    register_apart(monkeypatch)
+    monkeypatch.chdir(Path(files["fine"][0]).parent)
+    cloudpickle.register_pickle_by_value(sys.modules[__name__])
+    near = replace(vessel, truth_mesh_file="fine.msh", model_mesh_file="coarse.msh")
+    register(World("Near", near, NoFlow(), Cylinders(), schedule=Schedule(
+        time_step=0.02, scored_steps=4, pattern=TankOppositeDiagonalPattern(), warm_up=0, calibration=1)), "test/Near-v0")
+    with closing(Worker("estimation", "test/Near-v0", {}, write_baseline(tmp_path), kind)) as worker:
+        worker(None)
+        estimate = worker.update(np.zeros(8), np.zeros(8))
+    assert estimate.mean.shape == (files["coarse"][2].n_nodes,)
+    gym.registry.pop("test/Near-v0")
+
+
 def test_another_file_is_refused(files, vessel):
     """The world identifies the file by its hash; a missing group is named."""
     changed = RoundMeshVessel(files["fine"][0], "0" * 64, *files["coarse"][:2], 8)
     with pytest.raises(ValueError, match=r"fine\.msh: must be the file with SHA-256 0000"):
         changed.transport_mesh(True)
+    few = RoundMeshVessel(*files["fine"][:2], *files["coarse"][:2], 7)
+    with pytest.raises(ValueError, match="n_electrodes must be 8, the number of electrode groups in .*, got 7"):
+        few.electrode_model(False)
     many = RoundMeshVessel(*files["fine"][:2], *files["coarse"][:2], 9)
     with pytest.raises(ValueError, match="must have a group for each electrode, got none for electrode 8"):
         many.electrode_model(False)
