@@ -7,8 +7,7 @@ from eitbench.report.boards import leaderboard_table, leaderboards
 
 def said(table: Table) -> pd.DataFrame:
     """Return all cells as plain text under their headings."""
-    return pd.DataFrame([[cell.plain_text for cell in row.cells] for row in table.rows],
-                        columns=table.headings)
+    return pd.DataFrame([[cell.plain_text for cell in row.cells] for row in table.rows], columns=table.headings)
 
 
 def boards(records: list[dict]) -> pd.DataFrame:

@@ -54,8 +54,7 @@ def shared_ranks(scores: Mapping[str, Scores], *,
         return {}
     sign = -1.0 if higher_is_better else 1.0
     strata = _strata(scores)
-    values = {method: sign * float(statistic(*map(np.sort, own)))
-              for method, own in strata.items()}
+    values = {method: sign * float(statistic(*map(np.sort, own))) for method, own in strata.items()}
     order = sorted(scores, key=lambda method: (values[method], method))
     if not has_enough_episodes(next(iter(strata.values()))):
         return dict.fromkeys(order, 1)

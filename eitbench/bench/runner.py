@@ -131,8 +131,7 @@ class EstimatorOutput:
         """(T, n) mol/m³ for t = 1 … T"""
         self.variances = self.means.copy()
         """(T, n) (mol/m³)², NaN in states without a variance"""
-        self.velocities = np.tile(task.velocity.nominal if task.velocity else (),
-                                  (task.n_steps, 1))
+        self.velocities = np.tile(task.velocity.nominal if task.velocity else (), (task.n_steps, 1))
         """(T, k) parameters of the flow in m/s; k = 0 if the task specifies the flow"""
         self.innovations: dict[int, tuple[np.ndarray, np.ndarray]] = {}
         """measurement i -> (ν, S)"""

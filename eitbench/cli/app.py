@@ -66,9 +66,8 @@ def list_() -> None:
               for name in measured_ids()]
     for track, heading in (("estimation", "estimators"), ("injection", "policies")):
         lines.append((heading, "", ""))
-        methods = {name: load_method(name, track) for name in builtin_methods(track)}
-        lines += [(f"  {name}", ", ".join(method.subtracks), method.title)
-                  for name, method in methods.items()]
+        lines += [(f"  {name}", ", ".join((method := load_method(name, track)).subtracks),
+                   method.title) for name in builtin_methods(track)]
     for name, boards, about in lines:
         options.echo(f"{name:42} {boards:30}  {about}".rstrip())
 
@@ -159,11 +158,12 @@ def leaderboard(
         help="Folder of the leaderboards' records, such as leaderboards/results: render "
              "leaderboard.csv, leaderboard.md, episodes.csv.gz and the pages site/ next to it "
              "instead.")] = None,
+    env: options.Environments = None,
 ) -> None:
     """Print the table and rewrite the HTML report from the results stored in a folder.
 
-    With --records, invalid records are skipped and reported, with exit status 1. Without a valid
-    record, no file is written.
+    With --records, invalid records are reported, with exit status 1; without a valid one no file is
+    written. --env imports the module of a user-defined environment.
     """
     if records is None:
         with options.cli_errors():

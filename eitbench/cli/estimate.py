@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from math import isfinite
 from pathlib import Path
 from typing import Annotated
@@ -67,14 +68,12 @@ def estimate(
             require_round_tank(env.vessel)
         for warning in env.quality_warnings():
             options.echo(f"warning: {warning}", err=True)
-        runs = []
+        runs, kept = [], plotted_steps(env) if arrays is None else None
         for name in baseline:
-            kept = plotted_steps(env) if arrays is None else None
             try:
                 run = run_on_measurements(env, name, seed, kept=kept)
             except Exception as error:
-                raise ValueError(f"{name} failed on these measurements: "
-                                 f"{type(error).__name__}: {error}") from error
+                raise ValueError(f"{name} failed: {type(error).__name__}: {error}") from error
             runs.append(run)
             score = ("no measurement is withheld, so nothing is scored" if not env.withheld
                      else f"withheld RMSE {run.withheld_rmse:.2f} noise std, "
@@ -108,12 +107,10 @@ def _reader_options(texts: list[str]) -> dict[str, float | str]:
 
 def _steps(span: str) -> slice:
     """Parse a span such as ``0:800``."""
-    first, colon, last = span.partition(":")
-    if not (colon and first.isdigit() and (last.isdigit() or not last)):
-        raise ValueError(f"--span must be two numbers such as 0:800, got {span!r}")
-    if last and int(last) <= int(first):
-        raise ValueError(f"--span must end after it begins, got {span!r}")
-    return slice(int(first), int(last) if last else None)
+    ends = re.fullmatch(r"(\d+):(\d*)", span)
+    if ends is None or (ends[2] and int(ends[2]) <= int(ends[1])):
+        raise ValueError(f"--span must be two increasing numbers such as 0:800, got {span!r}")
+    return slice(int(ends[1]), int(ends[2]) if ends[2] else None)
 
 
 def _truth_scores(env, run, truth) -> str:  # type: ignore[no-untyped-def]

@@ -214,8 +214,7 @@ class NetworkCorrectedFilter:
         if lag < self.lag:
             assert isinstance(self.features, FilterFeatures)
             return self.features.filter.estimate(lag)
-        return apply_correction(self.network, self.features.c_ref, *self._last,
-                                self._hidden_state)
+        return apply_correction(self.network, self.features.c_ref, *self._last, self._hidden_state)
 
 
 def injection_one_hot(task: Task, currents: np.ndarray) -> np.ndarray:

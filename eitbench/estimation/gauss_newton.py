@@ -58,8 +58,7 @@ def gauss_newton(model: VoltageModel, voltages: np.ndarray, currents: np.ndarray
         gradient = A.T @ residual - penalty @ c
         direction = normal.solve(A, gradient)
         now = misfit(c, computed)
-        last = (gradient @ direction < tolerance * now
-                or np.abs(direction).max() < step_tolerance)
+        last = (gradient @ direction < tolerance * now or np.abs(direction).max() < step_tolerance)
         length = 1.0
         while True:
             trial = c + length * direction

@@ -154,8 +154,7 @@ def read_case(name: Path | str) -> MeasuredCase:
     entries = load_yaml(path, "case")
     if missing := [each for each in (*_TEXTS, "vessel") if each not in entries]:
         raise ValueError(f"{path}: case must have {', '.join(missing)}")
-    fixed = {each: entries.pop(each) for each in (*_TEXTS, "vessel", *_OPTIONAL)
-             if each in entries}
+    fixed = {each: entries.pop(each) for each in (*_TEXTS, "vessel", *_OPTIONAL) if each in entries}
     try:
         return MeasuredCase(path.stem, **fixed, settings=entries)
     except ValueError as error:

@@ -38,8 +38,7 @@ N_NAMED_SPIKES = 3
 
 
 def percent(fraction: float) -> str:
-    """Format a fraction with two significant digits, at least all before the point: ``0.13 %``,
-    ``130 %``."""
+    """Format a fraction with two digits, or all before the point: ``0.13 %``, ``130 %``."""
     return f"{100 * fraction:.2g} %" if fraction < 0.995 else f"{100 * fraction:.0f} %"
 
 
@@ -77,8 +76,7 @@ def spike_warnings(measurements: Measurements, spikes: np.ndarray) -> list[str]:
              f"{measurements.injection_index[t] + 1}, channel {m + 1} "
              f"({measurements.voltages[t, m]:.3g} V)" for t, m in found[:N_NAMED_SPIKES]]
     more = f" and {len(found) - N_NAMED_SPIKES} more" if len(found) > N_NAMED_SPIKES else ""
-    kind = "is a spike and is" if len(found) == 1 else "are spikes and are"
-    return [f"{len(found)} of {spikes.size} measurements {kind} left out: "
+    return [f"Spikes are left out, {len(found)} of {spikes.size} measurements: "
             f"{'; '.join(named)}{more}."]
 
 

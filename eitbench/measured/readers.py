@@ -24,11 +24,9 @@ TIME, LOWEST, HIGHEST, COUNT, AMPLITUDE, MODE = 3, 4, 5, 7, 8, 13
 """Header lines of Sciospec files, from 0: time of the frame, lowest and highest frequency in Hz,
 number of frequencies, peak current in A, measurement mode."""
 CHANNELS = "MeasurementChannels:"
-TIMESTAMP_FORMATS = ("%Y.%m.%d. %H:%M:%S.%f", "%Y.%m.%d. %H:%M:%S")
+TIMESTAMP_FORMAT = "%Y.%m.%d. %H:%M:%S.%f"
 SINGLE_ENDED, DIFFERENTIAL = "1", "2"
 """Measurement modes: potentials to ground, or differences of neighbouring channels."""
-EXPONENT = re.compile(r"[-+]?\d+(\.\d*)?[eE][-+]?\d+")
-"""Number such as 2e-3, which is text in YAML 1.1."""
 TABLE_VOLTAGES = ("potentials", "neighbours")
 DIFFERENCE_TITLE = re.compile(r".*\d\s*[-–]\s*\D*\d+\s*")
 """Title of a column such as ``U1-U2``."""
@@ -110,23 +108,18 @@ def read_sciospec(path: Path, *, frequency: float | None = None) -> Measurements
     digest = hashlib.sha256(b"".join(file.read_bytes() for file in files)).hexdigest()
     # every folder of frames is called setup; its parent's name identifies it
     name = f"{path.resolve().parent.name}/{path.name}" if path.is_dir() else path.name
-    kind = ("differences of neighbours" if is_differential
-            else "relative to the mean of all electrodes")
     return Measurements(
         _pair_currents(np.array(pairs), amplitude, L), np.tile(np.arange(K), len(files)),
         matrix, voltages.reshape(-1, L), times.ravel(),
         source={"file": name, "sha256": digest, "frames": len(files), "frequency": hertz,
-                "assumed": f"real parts, {kind}; amplitude in A"})
+                "assumed": "real parts; amplitude in A"})
 
 
 def _relative_to_mean(potentials: np.ndarray, index: np.ndarray) -> np.ndarray:
-    """Return potentials (T, L) relative to the mean of all electrodes, for injections ``index``.
-
-    A missing potential, or a spike, enters the mean with the electrode's median in the uses of the
-    injection; an electrode without any is left out of the mean.
-    """
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", RuntimeWarning)             # rows and columns of NaN
+    """Return potentials (T, L) relative to the mean of all electrodes, for injections ``index``. A
+    missing potential, or a spike, enters the mean with its median over the uses of the injection,
+    if there is one."""
+    with warnings.catch_warnings(action="ignore", category=RuntimeWarning):     # rows of NaN
         potentials = potentials - np.nanmedian(potentials, axis=1, keepdims=True)
         known = np.where(find_spikes(potentials, index), np.nan, potentials)
         for k in np.unique(index):
@@ -138,11 +131,8 @@ def _relative_to_mean(potentials: np.ndarray, index: np.ndarray) -> np.ndarray:
 
 def _pair_currents(pairs: np.ndarray, current: float, L: int) -> np.ndarray:
     """Return currents (K, L) in A that enter and leave at pairs (K, 2) of electrodes from 1."""
-    currents = np.zeros((len(pairs), L))
-    rows = np.arange(len(pairs))
-    currents[rows, pairs[:, 0] - 1] = current
-    currents[rows, pairs[:, 1] - 1] = -current
-    return currents
+    into, out = np.eye(L)[pairs.T - 1]
+    return current * (into - out)
 
 
 def _read_frame(path: Path, frequency: float | None) -> tuple[
@@ -152,7 +142,9 @@ def _read_frame(path: Path, frequency: float | None) -> tuple[
     try:
         lines = path.read_text(encoding="utf-8").splitlines()
         header = int(lines[0])
-        time = _timestamp(lines[TIME].strip())
+        stamp = lines[TIME].strip()
+        stamp += ".0" * (stamp.count(".") < 4)                              # a whole second
+        time = datetime.strptime(stamp, TIMESTAMP_FORMAT).timestamp()
         low, high, amplitude = (float(lines[at]) for at in (LOWEST, HIGHEST, AMPLITUDE))
         n_frequencies, mode = int(lines[COUNT]), lines[MODE].strip()
         channels = next(line for line in lines[:header] if line.startswith(CHANNELS))
@@ -177,16 +169,7 @@ def _read_frame(path: Path, frequency: float | None) -> tuple[
                          f"1 to {count}, and for each frequency ({n_frequencies}) {2 * count} "
                          "numbers with decimal points, two for each channel")
     hertz = low if frequency is None else frequency
-    return (time, (hertz, amplitude, mode == DIFFERENTIAL, pairs.tolist()),
-            parts[:, :2 * count:2])
-
-
-def _timestamp(text: str) -> float:
-    """Parse a time; a whole second has no fraction."""
-    try:
-        return datetime.strptime(text, TIMESTAMP_FORMATS[0]).timestamp()
-    except ValueError:
-        return datetime.strptime(text, TIMESTAMP_FORMATS[1]).timestamp()
+    return (time, (hertz, amplitude, mode == DIFFERENTIAL, pairs.tolist()), parts[:, :2 * count:2])
 
 
 def _frequency_index(path: Path, low: float, high: float, count: int,
@@ -238,8 +221,7 @@ def read_table(path: Path, *, electrodes: int, current: float, time_step: float 
     R = _check.integer("reference_rows", reference_rows, low=0)
     pairs, voltages, titles = _read_rows(path, L, decimal, separator)
     if readings is None:
-        named = titles and all(map(DIFFERENCE_TITLE.fullmatch, titles))
-        readings = "neighbours" if named else "potentials"
+        readings = TABLE_VOLTAGES[bool(titles and all(map(DIFFERENCE_TITLE.fullmatch, titles)))]
     voltages *= unit
     matrix = np.eye(L)
     if readings == "neighbours":
@@ -331,8 +313,8 @@ def load_yaml(path: Path, subject: str) -> dict[str, Any]:
         raise ValueError(f"{subject} must be a YAML file, got {path}: {error}") from None
     if not isinstance(content, dict):
         raise ValueError(f"{subject} must be a YAML file of entries like 'name: value', got {path}")
-    return {name: float(value) if isinstance(value, str) and EXPONENT.fullmatch(value) else value
-            for name, value in content.items()}
+    return {name: float(value) if isinstance(value, str) and _is_number(value, ".") else value
+            for name, value in content.items()}                         # YAML reads 2e-3 as text
 
 
 READERS: dict[str, Callable[..., Measurements]] = {

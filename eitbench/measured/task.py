@@ -199,8 +199,7 @@ class _NegTwoLogEvidence:
         for voltages, currents in (visible_measurement(model, measurements, t) for t in used):
             H, value, variance, _ = linear(voltages, currents)
             visible = H.any(axis=1) & np.isfinite(value)
-            self._data.append((H[visible] @ modes, (value - H @ point)[visible],
-                               variance[visible]))
+            self._data.append((H[visible] @ modes, (value - H @ point)[visible], variance[visible]))
 
     def __call__(self, noise: float, initial: float,
                  motion: Callable[[int], tuple[np.ndarray, np.ndarray]]) -> float:

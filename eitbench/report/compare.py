@@ -78,8 +78,7 @@ def find_records(name: str, folder: Path) -> list[dict[str, Any]]:
             raise ValueError(f"{name} fits several versions: {found}")
         if own:
             return own
-    raise ValueError(f"record of {name} not found in {folder}"
-                     + _check.did_you_mean(method, known))
+    raise ValueError(f"record of {name} not found in {folder}" + _check.did_you_mean(method, known))
 
 
 def mean_over_trainings(records: list[dict[str, Any]]) -> list[dict[str, Any]]:

@@ -16,6 +16,7 @@ from PIL import Image
 
 from eitbench._files import write_atomically
 from eitbench._sanitize import sanitize
+from eitbench.bench import tracks
 from eitbench.bench.records import group_runs
 from eitbench.bench.store import EpisodeStore
 from eitbench.bench.text import seed_ranges
@@ -80,6 +81,8 @@ def _snapshots(store: EpisodeStore, board: Leaderboard) -> dict[str, Any] | None
         warnings.warn(f"no pictures of {seed}: {error}", stacklevel=2)
         return None
     environment = records[0]["environment"]
+    if environment["id"] not in tracks.ids():       # of a module that this run did not import
+        return None
     env: Any = Environment(environment["id"], json.dumps(environment["kwargs"])).make()
     with allow_test_seeds():
         env.reset(seed=parse_seeds(seed)[0])

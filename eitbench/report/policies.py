@@ -32,8 +32,7 @@ def errors_by_policy(rows: pd.DataFrame) -> pd.DataFrame:
     in an episode come last. Agents that differ in their training seed are averaged."""
     errors = rows.assign(policy=rows["policy"].map(agent_name)).pivot_table(
         index="seed", columns="policy", values="error")
-    return errors[sorted(errors, key=lambda name: (errors[name].isna().any(),
-                                                   errors[name].mean()))]
+    return errors[sorted(errors, key=lambda name: (errors[name].isna().any(), errors[name].mean()))]
 
 
 def adaptivity_gap(rows: pd.DataFrame, open_loop: Sequence[str] = OPEN_LOOP,

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import io
 import json
+import re
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -98,18 +99,20 @@ def save_agent(model: Any, env: Any, folder: str | Path) -> Path:
     model : BaseAlgorithm
         Of a class in `eitbench.rl.training.ALGORITHMS`: PPO, DQN, SAC, RecurrentPPO, MaskablePPO.
     env : str or environment
-        Id of the injection environment, or the Gymnasium (vector) environment in which the model
-        was trained, with its arguments.
+        Id of the injection environment, or the environment (of Gymnasium or stable-baselines3) in
+        which the model was trained, with its arguments.
     folder : str or Path
-        Gets ``model.zip``, ``config.json`` and ``sha256``, the digest of the model.
+        Gets ``model.zip``, ``config.json`` and ``sha256``, the digest of the model. Agents in
+        folders whose names differ in the final number only are trainings of one agent.
 
     Raises
     ------
     ValueError
         If the model is of another class, or was not trained with scaled observations and actions
-        of this environment.
+        of this environment, or with a wrapper that normalises observations.
     """
     import gymnasium as gym
+    from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
     from eitbench.rl.training import ALGORITHMS, save_model
     algo = next((name for name, each in ALGORITHMS.items() if type(model) is each), None)
@@ -117,10 +120,15 @@ def save_agent(model: Any, env: Any, folder: str | Path) -> Path:
         raise ValueError("model must be of one of the classes "
                          f"{', '.join(each.__name__ for each in ALGORITHMS.values())}, got "
                          f"{type(model).__name__}; for others write a policy file with AgentPolicy")
-    spec = gym.spec(env) if isinstance(env, str) else getattr(env, "spec", None)
+    spec = (gym.spec(env) if isinstance(env, str)
+            else env.get_attr("spec")[0] if isinstance(env, VecEnv) else getattr(env, "spec", None))
     if spec is None or entry(spec.id).track != "injection":
         raise ValueError("env must be the id of an injection environment, or such an environment "
                          f"of gym.make or gym.make_vec, got {env!r}")
+    for vector in filter(None, (model.get_env(), env if isinstance(env, VecEnv) else None)):
+        if (((normalised := unwrap_vec_normalize(vector)) is not None and normalised.norm_obs)
+                or any(vector.env_is_wrapped(gym.wrappers.NormalizeObservation))):
+            raise ValueError("model must be trained with scaled observations, got normalised ones")
     kwargs = {name: value for name, value in spec.kwargs.items()
               if name in ("variant", "world", "gate", "inflow", "estimator")}
     core: Any = gym.make(spec.id, disable_env_checker=True, **kwargs).unwrapped
@@ -130,8 +138,9 @@ def save_agent(model: Any, env: Any, folder: str | Path) -> Path:
             raise ValueError(f"model must have the {name} of {spec.id} with scaled observations, "
                              f"{expected}, got {got}")
     folder = Path(folder)
+    name = re.sub(r"[_-]?(seed)?\d*$", "", folder.resolve().name)      # of all trainings
     settings = {"env": spec.id, "kwargs": kwargs, "algo": algo, "seed": model.seed or 0,
-                "config": {"total_steps": int(model.num_timesteps)}}
+                "name": name, "config": {"total_steps": int(model.num_timesteps)}}
     path = folder / "model.zip"
     save_model(model, path)
     write_atomically(folder / "config.json", json.dumps(settings, indent=1).encode())

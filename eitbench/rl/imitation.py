@@ -103,8 +103,7 @@ def rollout(world: InjectionEnv, method: Method, episode: int, random: np.random
     while not ended:
         actions.append(policy.act(observation))
         seen.append(flatten_scaled(world.rules, observation))
-        observation, reward, ended, _, _ = world.step(
-            actions[-1] if act is None else act(seen[-1]))
+        observation, reward, ended, _, _ = world.step(actions[-1] if act is None else act(seen[-1]))
         rewards.append(reward)
     return np.array(seen), np.array(actions), np.array(rewards)
 

@@ -362,7 +362,7 @@ class MeshVessel:
             raise ValueError(f"{self._file(fine)[0]}: must have a group for each electrode, got "
                              f"none for {', '.join(missing)}; there are {', '.join(groups)}")
         if len(numbered) > self.n_electrodes:
-            raise ValueError(f"n_electrodes must be {len(numbered)}, the number of electrode groups "
+            raise ValueError(f"n_electrodes must be {len(numbered)}, the number of groups "
                              f"in {self._file(fine)[0]}, got {self.n_electrodes}")
         electrodes = [numbered[number] for number in numbers]
         return CompleteElectrodeModel(mesh, electrodes, self.contact_impedance)

@@ -17,8 +17,7 @@ from eitbench.data.parallel import BACKENDS, WorkerLostError, run_parallel
 from tiny import FILTER, count, write_baseline
 
 CLUSTERS = {"ray": "ray", "dask": "distributed"}
-KILL = ("open({log!r}, 'a').write('made\\n'); "
-        "len(open({log!r}).readlines()) == 2 and os.kill(os.getpid(), 9)")
+KILL = ("open({log!r}, 'a').write('made\\n'); " "len(open({log!r}).readlines()) == 2 and os.kill(os.getpid(), 9)")
 """Estimator whose second instance kills its process."""
 
 

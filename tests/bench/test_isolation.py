@@ -97,8 +97,7 @@ def test_scores_are_identical(environment, kind, tmp_path):
         "return Estimate(self.level, self.level**2, voltages, np.eye(4) + np.outer(voltages, voltages)) "
         "if self.calls > self.task.lag else None")
     for seed in (1, 2):
-        (here, fields), (there, others) = (run_episode(Job(environment, path, seed, each))
-                                           for each in ("none", kind))
+        (here, fields), (there, others) = (run_episode(Job(environment, path, seed, each)) for each in ("none", kind))
         assert here["status"] == "ok" and lasting(here) == lasting(there)
         assert set(fields) == set(others) and all((fields[name] == others[name]).all() for name in fields)
         assert here["peak_memory"] is None and 50e6 < there["peak_memory"] < 8e9

@@ -28,8 +28,7 @@ SEED = 5
 
 
 def environment(name: str) -> InjectionEnv:
-    return runner.cached_environment(
-        Environment(name, json.dumps(KWARGS[name] | {"estimator": "reduced"})))
+    return runner.cached_environment(Environment(name, json.dumps(KWARGS[name] | {"estimator": "reduced"})))
 
 
 def actions_of(name: str, policy: str, monkeypatch) -> list[np.ndarray]:
@@ -255,8 +254,7 @@ def test_a_third_party_file_runs(tmp_path):
     loaded = load_method(path := write_policy(tmp_path), "injection")
     assert (loaded.name, loaded.title, loaded.privileged, loaded.parameters) == ("mine", "Mine", False, {})
     played = injected(NAME, SHORT, path, SEED, "reduced")
-    assert played.errors.tolist() == injected(
-        NAME, SHORT, "best_pair", SEED, "reduced").errors.tolist()
+    assert played.errors.tolist() == injected(NAME, SHORT, "best_pair", SEED, "reduced").errors.tolist()
     with pytest.raises(ValueError, match="action must be an integer"):
         wrong = write_policy(tmp_path, "def act(self, observation): return 0.5", "wrong")
         injected(NAME, SHORT, wrong, SEED, "reduced")

@@ -136,8 +136,7 @@ def test_estimators_receive_the_task_and_measurements_only(environment):
         observation, *_ = env.step(np.full(1701, 30.0))
 
 
-BIASED = Environment("eitbench/Pipe2DSmoothing-v0",
-                     json.dumps({"world": FAST, "assume": {"mean_velocity": 30.0}}))
+BIASED = Environment("eitbench/Pipe2DSmoothing-v0", json.dumps({"world": FAST, "assume": {"mean_velocity": 30.0}}))
 
 
 @pytest.mark.parametrize("environment", [FIXED_LAG, BIASED], ids=["fixed-lag", "biased"])

@@ -30,8 +30,7 @@ def test_a_submission_is_a_record_per_environment(tmp_path):
     """Records are self-reported without the flag; the same command runs nothing."""
     log = tmp_path / "log"
     mine, store, to = write_baseline(tmp_path, init=counting(log)), EpisodeStore(tmp_path / "results"), tmp_path / "to"
-    paths = list(submit(mine, [FILTER.id, SMOOTHING.id], TEST, store, to, isolate="none",
-                        command="eitbench submit"))
+    paths = list(submit(mine, [FILTER.id, SMOOTHING.id], TEST, store, to, isolate="none", command="eitbench submit"))
     first, second = (read_record(path) for path in paths)
     assert (first["board"], second["board"]) == ("filter", "smoothing") and count(log) == 4
     assert first["seeds"] == ["test:0", "test:1"] and not first["official"] and first["split"] == "test"
@@ -45,8 +44,7 @@ def test_a_submission_is_a_record_per_environment(tmp_path):
 
 def test_all_built_in_methods_by_one_command(tmp_path, monkeypatch):
     """All compatible methods run, by environment: finished environments have records after an interruption."""
-    ours = {"estimation": ["homogeneous", "fixed_interval_smoother"],
-            "injection": ["random_pair", "event_triggered"]}
+    ours = {"estimation": ["homogeneous", "fixed_interval_smoother"], "injection": ["random_pair", "event_triggered"]}
     monkeypatch.setattr(suites, "builtin_methods", ours.get)
     monkeypatch.setattr(suites, "builtin_agents", lambda id: [])
     made = submit(None, [FILTER.id, INJECTION], TEST[:1], EpisodeStore(tmp_path / "r"), tmp_path / "to")
@@ -84,8 +82,7 @@ def test_policies_in_records_are_not_rerun(tmp_path):
     """The table has all episodes; only episodes without a record are run."""
     policy, short = ("--env", INJECTION, "--policy", "adjacent"), ("-j", "1", "-o")
     assert eitbench("submit", *policy, "--seeds", "test:0", *short, "first")[0] == 0
-    code, said, _ = eitbench("run", *policy, "--seeds", "test:0-1", "--records", "leaderboards/results", *short,
-                             "rest")
+    code, said, _ = eitbench("run", *policy, "--seeds", "test:0-1", "--records", "leaderboards/results", *short, "rest")
     assert code == 0 and [path.name for path in tmp_path.glob("rest/episodes/*/*/*.json")] == ["test-1.json"]
     (score,) = re.findall(r"\| adjacent +\| ([^|]+) \|", said)
     assert f"{score} |" in eitbench("run", *policy, "--seeds", "test:0-1", *short, "all")[1]

@@ -137,8 +137,7 @@ def simulate_voltages(vessel, centre, radius, ratio=0.3, noise=1e-3):
 
 def locate_inclusion(folder, file, vessel):
     """Return the centroid (d,) in m of the inclusion that the command estimates."""
-    code, _, err = estimate(folder, file, vessel, "--baseline", "log_map", "--still", "--arrays",
-                            folder / "arrays.npz")
+    code, _, err = estimate(folder, file, vessel, "--baseline", "log_map", "--still", "--arrays", folder / "arrays.npz")
     assert code == 0, err
     with np.load(folder / "arrays.npz") as arrays:
         return centroid(arrays["points"], arrays["mean"][-1])

@@ -17,8 +17,7 @@ def random_pattern(n: int, n_ports: int, seed: int) -> sp.csc_array:
     rng = np.random.default_rng(seed)
     side = int(np.ceil(np.sqrt(n - n_ports)))
     i = np.arange(n - n_ports)
-    edges = [np.stack([i[:-1], i[1:]]), np.stack([i[:-side], i[side:]]),
-             rng.integers(0, n - n_ports, (2, n // 10))]
+    edges = [np.stack([i[:-1], i[1:]]), np.stack([i[:-side], i[side:]]), rng.integers(0, n - n_ports, (2, n // 10))]
     for port in range(n - n_ports, n):
         touched = rng.choice(n - n_ports, max(1, n // 8), replace=False)
         edges.append(np.stack([touched, np.full(len(touched), port)]))
@@ -85,8 +84,7 @@ def test_wide_fronts_are_taken_one_by_one(monkeypatch):
     """If eight matrices do not fit into the caches, each is factorised alone, with the same accuracy."""
     pattern = random_pattern(180, 7, seed=2)
     system = Condensation(pattern, 7)
-    values = np.stack([K[system.rows, system.columns]
-                       for K in random_matrices(pattern, 3, seed=5)], axis=1)
+    values = np.stack([K[system.rows, system.columns] for K in random_matrices(pattern, 3, seed=5)], axis=1)
     together = system.port_inverse(values)
     monkeypatch.setattr(condensation, "_WIDEST", 0)
     alone = Condensation(pattern, 7)
@@ -108,8 +106,7 @@ def test_a_state_keeps_its_bits_wherever_it_stands_in_a_batch():
     """Lanes are independent, and a batch of any length gives the same numbers."""
     pattern = random_pattern(200, 6, seed=4)
     system = Condensation(pattern, 6)
-    values = np.stack([K[system.rows, system.columns]
-                       for K in random_matrices(pattern, 20, seed=5)], axis=1)
+    values = np.stack([K[system.rows, system.columns] for K in random_matrices(pattern, 20, seed=5)], axis=1)
     whole = system.port_inverse(values)
     backwards = system.port_inverse(values[:, ::-1])[::-1]
     assert_array_equal(whole, backwards)

@@ -26,8 +26,7 @@ def groups_of(mesh: Mesh) -> dict[str, np.ndarray]:
     left, right = end_facets(mesh)
     ends = {tuple(facet) for facet in np.concatenate([left, right]).tolist()}
     rest = [facet for facet in mesh.boundary_facets.tolist() if tuple(facet) not in ends]
-    return {"inlet": left, "electrode 1": right, "walls": np.array(rest),
-            "everything (∂Ω)": mesh.boundary_facets}
+    return {"inlet": left, "electrode 1": right, "walls": np.array(rest), "everything (∂Ω)": mesh.boundary_facets}
 
 
 # -- round trips ----------------------------------------------------------------------------------
@@ -39,8 +38,7 @@ def test_round_trip(dim, tmp_path):
     lengths are divided by a thousand."""
     mesh = MESHES[dim]
     groups = groups_of(mesh)
-    turned = {name: np.random.default_rng(0).permutation(facets[:, ::-1])
-              for name, facets in groups.items()}
+    turned = {name: np.random.default_rng(0).permutation(facets[:, ::-1]) for name, facets in groups.items()}
     write_mesh(tmp_path / "box.msh", mesh, turned)
     read = read_mesh(tmp_path / "box.msh")
     assert_array_equal(read.mesh.points, mesh.points)

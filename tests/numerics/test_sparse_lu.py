@@ -64,8 +64,7 @@ def test_a_column_does_not_depend_on_others():
     for j in range(20):
         assert_array_equal(solver.solve(right[:, j:j + 1])[:, 0], whole[:, j])
     beside = right.copy()
-    beside[:, 1::2] = np.array([np.nan, np.inf, 1e300, -1e-300, 0.0, 1.0, -np.inf, np.nan, 1e9,
-                                5.0])
+    beside[:, 1::2] = np.array([np.nan, np.inf, 1e300, -1e-300, 0.0, 1.0, -np.inf, np.nan, 1e9, 5.0])
     assert_array_equal(solver.solve(beside)[:, ::2], whole[:, ::2])
 
 

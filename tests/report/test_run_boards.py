@@ -145,8 +145,7 @@ def test_order_of_boards_and_methods():
                made("f", "filter", [0.1], id="eitbench/Pipe3D-v0"), made("b", "filter", [0.3]),
                made("a", "filter", [0.2])]
     found = run_leaderboards(records)
-    assert [[row.cells["method"] for row in board.rows] for board in found] == [
-        ["a", "b", "c"], ["d"], ["f"], ["e"]]
+    assert [[row.cells["method"] for row in board.rows] for board in found] == [["a", "b", "c"], ["d"], ["f"], ["e"]]
     assert all(row.cells["rank"] is None for board in found for row in board.rows)
 
 

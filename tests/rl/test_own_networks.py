@@ -15,6 +15,7 @@ from eitbench.data.seeds import parse_seeds
 from eitbench.rl import save_agent
 from sb3_contrib import TRPO
 from stable_baselines3 import PPO
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from short import shorten, world
 from tiny import git_says
@@ -103,9 +104,17 @@ def test_a_model_of_stable_baselines3_is_an_agent(estimator, tmp_path):
     for kwargs in ({"estimator": estimator}, {"estimator": "full"}):
         actions, seen = rollout(method, **kwargs)
         if kwargs["estimator"] == estimator:
-            assert [int(each) for each in actions] == [int(model.predict(each, deterministic=True)[0])
-                                                       for each in seen]
+            assert [int(each) for each in actions] == [int(model.predict(each, deterministic=True)[0]) for each in seen]
     assert assert_submits(path, NAME, tmp_path)["method"] == method.name
+
+
+def test_names_of_saved_agents(tmp_path):
+    """Trainings in folders with numbers are one agent, other folders other agents; a vector of SB3 names its id."""
+    env = DummyVecEnv([lambda: gym.make(NAME, **SHORT)])
+    names = [load_method(str(save_agent(PPO("MlpPolicy", env, seed=seed), env, tmp_path / folder)), "injection").name
+             for folder, seed in (("mine_0", 0), ("mine_1", 1), ("other", 0))]
+    first, second, other = (name.rpartition("_seed") for name in names)
+    assert first[0] == second[0] != other[0] and (first[2], second[2], other[2]) == ("0", "1", "0")
 
 
 def test_what_is_no_agent_is_refused(tmp_path):
@@ -116,6 +125,8 @@ def test_what_is_no_agent_is_refused(tmp_path):
             (TRPO("MlpPolicy", env), env, "model must be of one of the classes PPO, .*got TRPO"),
             (model, FILTER, "env must be the id of an injection environment"),
             (model, gym.make("CartPole-v1"), "env must be one of eitbench/"),
+            (PPO("MlpPolicy", VecNormalize(DummyVecEnv([lambda: env]))), NAME, "got normalised ones"),
+            (PPO("MlpPolicy", gym.wrappers.NormalizeObservation(env)), NAME, "got normalised ones"),
             (PPO("MlpPolicy", gym.make("CartPole-v1")), NAME, "model must have the observation_space of")]:
         with pytest.raises(ValueError, match=message):
             save_agent(each, place, tmp_path / "agent")

@@ -84,8 +84,7 @@ class ReducedFilters(EpisodeFilters):
         return (quadratic - 2.0 * (state * moments).sum(axis=1) + deviations) / squares
 
     def means(self) -> np.ndarray:
-        return self.c_ref[:, None] * (
-            1.0 + self.coordinates @ self.shared.states.basis.T)
+        return self.c_ref[:, None] * (1.0 + self.coordinates @ self.shared.states.basis.T)
 
     def stds(self) -> np.ndarray:
         return self.c_ref[:, None] * self._deviation(self.shared.single.basis)

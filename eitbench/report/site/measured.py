@@ -127,5 +127,4 @@ def _method_cell(record: dict[str, Any], title: str = "") -> Cell:
     badges = [*filter(None, [BADGES.get(record["role"], record["role"])]),
               *["self-reported"] * (not record["official"])]
     shown = title or _label(record)
-    return Cell(shown, shown.casefold(), note=_label(record) if title else "",
-                badges=tuple(badges))
+    return Cell(shown, shown.casefold(), note=_label(record) if title else "", badges=tuple(badges))
