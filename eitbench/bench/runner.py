@@ -18,8 +18,8 @@ from eitbench.bench.measured import MeasuredRun
 from eitbench.bench.methods import Method, load_method
 from eitbench.bench.scores import Outcome
 from eitbench.bench.tracks import Environment, check_track, is_measured, subtrack_of
-from eitbench.data.episode_cache import region_operators
-from eitbench.data.episodes import simulate, truth_mesh
+from eitbench.data.episode_cache import region_operators, truth_mesh
+from eitbench.data.episodes import simulate
 from eitbench.data.seeds import allow_test_seeds
 from eitbench.envs.estimation import EstimationEnv
 from eitbench.envs.injection import InjectionEnv

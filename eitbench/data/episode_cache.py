@@ -22,10 +22,10 @@ from eitbench.data import cache
 from eitbench.data.episodes import (
     Episode,
     cache_per_truth,
+    cached_truth_model,
     is_simulated,
     simulate,
     simulate_batch,
-    truth_mesh,
 )
 from eitbench.physics.profiles import VelocityModel
 from eitbench.worlds.instrument import Faults, Instrument
@@ -283,6 +283,11 @@ def region_file(world: World) -> cache.File:
     configuration = [cache.config_dict(world.vessel), world.region]
     key = cache.model_key("region", configuration, SCORING_VERSION)
     return cache.File(key, lambda: _half_mass(*region_operators(world)))
+
+
+def truth_mesh(world: World) -> Mesh:
+    """Return the mesh of the ground truth."""
+    return cached_truth_model(world).transport.mesh
 
 
 @cache_per_truth(2)

@@ -16,7 +16,6 @@ from tqdm import tqdm
 from eitbench import _check
 from eitbench._notice import SlowTaskNotice
 from eitbench.data.cache import Key, cached, episode_key
-from eitbench.numerics.mesh import Mesh
 from eitbench.worlds.instrument import Faults
 from eitbench.worlds.random_streams import episode_streams
 from eitbench.worlds.world import Discretisation, World
@@ -93,11 +92,6 @@ def cache_per_truth(size: int) -> Callable[[Callable[[World], Made]], Callable[[
 def cached_truth_model(world: World) -> Discretisation:
     """Return ``world.truth_model()``, cached."""
     return world.truth_model()
-
-
-def truth_mesh(world: World) -> Mesh:
-    """Return the mesh of the ground truth."""
-    return cached_truth_model(world).transport.mesh
 
 
 def simulate_batch(world: World, seeds: Sequence[int], progress: bool = True,

@@ -123,7 +123,7 @@ class EpisodeCore(ABC):
         """(height, width, 3) uint8: truth, estimate, its standard deviation, electrodes."""
         with require_extra("render()"):
             from eitbench.envs.rendering import draw_frame
-        from eitbench.data.episodes import truth_mesh
+        from eitbench.data.episode_cache import truth_mesh
         t, estimate, std, currents = self.picture(b)
         world = self.world
         truth = concentration_at(world, self.seeds[b], t, self.n_initial + 1)

@@ -17,7 +17,7 @@ from eitbench.bench.isolation import choose_isolation
 from eitbench.bench.methods import Method
 from eitbench.bench.run import Job
 from eitbench.bench.tracks import Environment, subtrack_of
-from eitbench.data.episodes import truth_mesh
+from eitbench.data.episode_cache import truth_mesh
 from eitbench.envs.rendering import (
     FIELD_COLORMAP,
     IDLE,

@@ -21,7 +21,7 @@ from eitbench.bench.records import group_runs
 from eitbench.bench.store import EpisodeStore
 from eitbench.bench.text import seed_ranges
 from eitbench.bench.tracks import Environment
-from eitbench.data.episodes import truth_mesh
+from eitbench.data.episode_cache import truth_mesh
 from eitbench.data.seeds import allow_test_seeds, parse_seeds
 from eitbench.envs.rendering import FIELD_COLORMAP, colour_range, draw_field
 from eitbench.numerics.mesh import Mesh

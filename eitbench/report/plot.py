@@ -17,8 +17,8 @@ from eitbench.bench.evaluation import resolve_environment, resolve_method
 from eitbench.bench.runner import is_compatible, iter_estimates, iter_injections
 from eitbench.bench.scores import scores
 from eitbench.bench.text import mean_and_interval
-from eitbench.data.episode_cache import region_operators
-from eitbench.data.episodes import simulate, truth_mesh
+from eitbench.data.episode_cache import region_operators, truth_mesh
+from eitbench.data.episodes import simulate
 from eitbench.data.seeds import format_seed, parse_seeds
 from eitbench.envs.injection import InjectionEnv
 from eitbench.envs.rendering import colour_range, draw_electrodes, draw_field

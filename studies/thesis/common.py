@@ -17,8 +17,7 @@ from tqdm import tqdm
 from eitbench import scoring
 from eitbench.bench.methods import load_method
 from eitbench.bench.runner import iter_estimates
-from eitbench.data.episode_cache import score_operators
-from eitbench.data.episodes import truth_mesh
+from eitbench.data.episode_cache import score_operators, truth_mesh
 from eitbench.envs.estimation import EstimationEnv
 from eitbench.envs.rendering import STD_COLORMAP, colour_range, draw_electrodes, draw_field
 from eitbench.numerics.mesh import Mesh

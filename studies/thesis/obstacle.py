@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
-from eitbench.data.episodes import truth_mesh
+from eitbench.data.episode_cache import truth_mesh
 from eitbench.envs.estimation import EstimationEnv
 from eitbench.numerics.fem import mass_matrix
 from eitbench.physics.transport import VelocityField

@@ -13,8 +13,7 @@ from eitbench import scoring
 from eitbench.bench.methods import load_method
 from eitbench.bench.runner import run_estimator
 from eitbench.bench.scores import compute_scores
-from eitbench.data.episode_cache import score_operators
-from eitbench.data.episodes import truth_mesh
+from eitbench.data.episode_cache import score_operators, truth_mesh
 from eitbench.envs.estimation import EstimationEnv
 from eitbench.envs.rendering import STD_COLORMAP, colour_range, draw_field
 

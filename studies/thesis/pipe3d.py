@@ -6,7 +6,7 @@ from pathlib import Path
 
 from matplotlib.figure import Figure
 
-from eitbench.data.episodes import truth_mesh
+from eitbench.data.episode_cache import truth_mesh
 from eitbench.envs.estimation import EstimationEnv
 from eitbench.envs.isosurface import draw_isosurfaces
 from eitbench.envs.rendering import colour_range, draw_field

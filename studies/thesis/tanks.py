@@ -11,7 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 
-from eitbench.data.episodes import truth_mesh
+from eitbench.data.episode_cache import truth_mesh
 from eitbench.envs.estimation import EstimationEnv
 from eitbench.envs.rendering import draw_field
 from eitbench.estimation import CalibrationFrame

@@ -15,7 +15,8 @@ from eitbench.bench.runner import EstimatorOutput, run_estimator
 from eitbench.bench.store import EpisodeStore
 from eitbench.bench.tracks import Environment, subtrack_of
 from eitbench.data.cache import CACHE_VARIABLE
-from eitbench.data.episodes import simulate, truth_mesh
+from eitbench.data.episode_cache import truth_mesh
+from eitbench.data.episodes import simulate
 from eitbench.worlds.catalogue import PIPE_2D
 from eitbench.worlds.task import Estimate, Task
 from scipy.optimize import minimize_scalar

@@ -19,8 +19,9 @@ from eitbench.data.episode_cache import (
     is_episode_cached,
     scoring_constants,
     step_error,
+    truth_mesh,
 )
-from eitbench.data.episodes import simulate, truth_mesh
+from eitbench.data.episodes import simulate
 from eitbench.worlds import entry
 
 from recorded import bits

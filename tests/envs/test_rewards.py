@@ -7,8 +7,7 @@ import pytest
 from eitbench import Estimate, scoring
 from eitbench.bench.runner import run_estimator
 from eitbench.bench.scores import compute_scores
-from eitbench.data.episode_cache import score_operators
-from eitbench.data.episodes import truth_mesh
+from eitbench.data.episode_cache import score_operators, truth_mesh
 from estimation_envs import KINDS, PIPE, SKEWED, UNKNOWN, best_velocity, make
 
 

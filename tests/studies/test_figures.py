@@ -11,7 +11,7 @@ import pytest
 from eitbench.bench.methods import load_method
 from eitbench.bench.text import seed_ranges
 from eitbench.data.cache import CACHE_VARIABLE
-from eitbench.data.episodes import truth_mesh
+from eitbench.data.episode_cache import truth_mesh
 from eitbench.data.seeds import format_seed
 from eitbench.envs.estimation import EstimationEnv
 from eitbench.estimation import CalibrationFrame, initial_covariance
