@@ -16,7 +16,12 @@ from eitbench.estimation.covariance import (
     OpenLoopCovariance,
 )
 from eitbench.estimation.ensemble import EnsembleFilter
-from eitbench.estimation.estimators import CalibrationFrame, FilterEstimator, RecordSmoother
+from eitbench.estimation.estimators import (
+    CalibrationFrame,
+    FilterEstimator,
+    FrameEstimator,
+    RecordSmoother,
+)
 from eitbench.estimation.filter import Filter, StateSpace, Step, kalman_filter
 from eitbench.estimation.forward import (
     LinearisedForwardModel,
@@ -24,7 +29,13 @@ from eitbench.estimation.forward import (
     linearise_at_reference,
     linearise_voltages,
 )
-from eitbench.estimation.gauss_newton import StationaryMap, gauss_newton
+from eitbench.estimation.gauss_newton import (
+    StationaryMap,
+    gauss_newton,
+    noser_prior,
+    one_step,
+    total_variation,
+)
 from eitbench.estimation.gaussian import LinearMeasurement, condition, innovate
 from eitbench.estimation.homogeneous import best_homogeneous
 from eitbench.estimation.identification import identify_model
@@ -75,7 +86,7 @@ from eitbench.estimation.velocity import (
 
 __all__ = [
     "CalibrationFrame", "DenseCovariance", "EnsembleFilter", "Filter", "FilterEstimator",
-    "FilterFeatures", "IdentifiedModel", "ImpulseResponse", "InflowPrior", "InflowWindow",
+    "FilterFeatures", "FrameEstimator", "IdentifiedModel", "ImpulseResponse", "InflowPrior", "InflowWindow",
     "LinearMeasurement", "LinearisedForwardModel", "LogStates", "LowRankCovariance", "Motion",
     "NetworkCorrectedFilter", "NodalStates", "OpenLoopCovariance", "ParticleInflowFilter",
     "QuadraticVoltageModel", "RecordSmoother", "Regimes", "ScaledVoltageModel", "StateSpace",
@@ -86,8 +97,8 @@ __all__ = [
     "gauss_newton", "gru_step", "identify_model", "inflow_filter", "initial_covariance",
     "initial_hidden_state", "innovate", "kalman_filter", "linearise_at_prediction",
     "linearise_at_reference", "linearise_voltages", "load_network", "map_inflow",
-    "maximise_posterior", "modal_states", "network_matches_task", "nodal_filter", "nodal_states",
+    "maximise_posterior", "noser_prior", "one_step", "modal_states", "network_matches_task", "nodal_filter", "nodal_states",
     "reduced_response", "scaled_velocity_prior", "smooth_means", "smooth_state",
     "smoothness_covariance", "steady_response", "table_5_1_filter", "task_velocity_prior",
-    "time_varying_responses", "velocity_states",
+    "time_varying_responses", "total_variation", "velocity_states",
 ]

@@ -14,6 +14,9 @@ Measurement = tuple[np.ndarray, np.ndarray]
 """Voltages (L,) in V and currents (L,) in A (A/m in 2D) of one injection."""
 
 
+Reconstruction = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
+
+
 class CalibrationFrame:
     """Calibration frame: the first injections, which determine ĉ_bh, the scale of Table 5.1.
 
@@ -128,3 +131,46 @@ class RecordSmoother:
         if len(self._estimates) < len(self._record):
             self._estimates = self._smooth(self._record)
         return self._estimates[-1 - lag]
+
+
+class FrameEstimator:
+    """Estimator that reconstructs a frame of measurements at a time, as of a stationary target.
+
+    In filtering the frame consists of the latest measurements; with a lag each state gets the image
+    of the frame that contains it, as in the thesis (Fig. 5.6).
+
+    Parameters
+    ----------
+    task : Task
+    reconstruct : callable
+        Voltages (K, L) in V and currents (K, L) in A of a frame, and ĉ_bh (n,) of this frame in
+        mol/m³ -> the image (n,) in mol/m³.
+    """
+
+    def __init__(self, task: Task, reconstruct: Reconstruction) -> None:
+        self.task = task
+        self._reconstruct = reconstruct
+        self._record: list[Measurement] = []
+        self._images: dict[int, np.ndarray] = {}
+        self._requested = -task.lag
+
+    def update(self, voltages: np.ndarray, currents: np.ndarray) -> Estimate | None:
+        """Return the image of the state t − lag after measurement t, (L,) V and A each."""
+        task = self.task
+        self._requested += 1
+        if len(self._record) < task.n_steps:
+            self._record.append((voltages, currents))
+        if self._requested < 1:
+            return None
+        frame = len(task.currents)
+        end = len(self._record)
+        if task.lag > 0:
+            end = min(-(-self._requested // frame) * frame, task.n_steps)
+        if end not in self._images:
+            V, I = (np.array(part)
+                    for part in zip(*self._record[max(0, end - frame):end], strict=True))
+            n = task.mesh.n_nodes
+            c_bh = best_homogeneous(task.observation, task.noise, n, V, I,
+                                    task.expected_concentration)
+            self._images = {end: self._reconstruct(V, I, np.full(n, c_bh))}
+        return Estimate(self._images[end])

@@ -45,6 +45,12 @@ def laplace(u, v, _w):
     return dot(grad(u), grad(v))
 
 
+@skfem.BilinearForm
+def weighted_laplace(u, v, w):
+    """∫w ∇φᵢ·∇φⱼ."""
+    return w.weight * dot(grad(u), grad(v))
+
+
 @skfem.LinearForm
 def integral(v, _w):
     """∫φᵢ."""
@@ -67,3 +73,11 @@ def mass_matrix(mesh: Mesh) -> sp.csr_array:
 def stiffness_matrix(mesh: Mesh) -> sp.csr_array:
     """Return the P1 stiffness matrix (n, n) ∫∇φᵢ·∇φⱼ in m^(d-2)."""
     return sp.csr_array(laplace.assemble(basis(mesh, 1, intorder=1)))
+
+
+def diffusivity_matrix(mesh: Mesh, c: np.ndarray, smoothing: float) -> sp.csr_array:
+    """Return the stiffness matrix (n, n) ∫∇φᵢ·∇φⱼ/√(|∇c|² + smoothing²), whose quadratic form at c
+    (n,) is the total variation of c, for ``smoothing`` ≪ |∇c|."""
+    elements = basis(mesh, 1, intorder=1)
+    steepness = np.sqrt((elements.interpolate(c).grad**2).sum(axis=0) + smoothing**2)
+    return sp.csr_array(weighted_laplace.assemble(elements, weight=1.0 / steepness))

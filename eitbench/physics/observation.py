@@ -62,8 +62,9 @@ class VoltageNoise:
         _check.number("floor", self.floor, low=0.0, units="V")
 
     def std(self, voltages: np.ndarray) -> np.ndarray:
-        """Return the standard deviation in V for noise-free ``voltages`` (..., L)."""
-        largest = np.abs(voltages).max(axis=-1, keepdims=True)
+        """Return the standard deviation in V for noise-free ``voltages`` (..., L), NaN where those
+        are."""
+        largest = np.fmax.reduce(np.abs(voltages), axis=-1, keepdims=True)
         variance = (self.relative * voltages)**2 + (self.relative_to_max * largest)**2
         return np.sqrt(variance + self.floor**2)
 

@@ -1,0 +1,35 @@
+"""Kalman filter with a random walk, F = I: the field's default where the flow is unknown (Vauhkonen,
+Karjalainen & Kaipio 1998).
+
+The concentration changes by an independent Matérn field in each time step. It has the correlation
+LENGTH and the standard deviation STEP ĉ_bh, the initial state INITIAL_STD ĉ_bh; chosen on training episodes by
+`studies/tune_random_walk.py`; voltages are linearised about ĉ_bh.
+"""
+
+from dataclasses import replace
+
+from eitbench import Task
+from eitbench.estimation import FilterEstimator, linearise_at_reference, nodal_filter
+from eitbench.estimation.walk import RandomWalk
+from eitbench.physics.stationary import StationaryTransport
+
+LENGTH = 0.028
+"""m"""
+STEP = 0.01
+INITIAL_STD = 0.25
+
+
+class Estimator(FilterEstimator):
+    subtracks = ("filter",)
+    parameters = {"length": LENGTH, "step": STEP,  # noqa: RUF012 (for a record)
+                  "initial_std": INITIAL_STD}
+
+    def __init__(self, task: Task) -> None:
+        walk = RandomWalk(task.mesh, task.transport.time_step, LENGTH)
+        prior = replace(task.prior, nodal_std=STEP, initial_std=INITIAL_STD, initial_length=LENGTH)
+        super().__init__(task, lambda c_ref: nodal_filter(
+            walk, prior, c_ref, linearise_at_reference(task, c_ref)))
+
+    @staticmethod
+    def suits(task: Task) -> bool:
+        return not isinstance(task.transport, StationaryTransport | RandomWalk)

@@ -1,0 +1,45 @@
+"""Choose the constants of the methods without a flow model: `python studies/tune_random_walk.py`.
+
+The rule: the smallest mean error on a grid, in filtering in the 2D pipe on train:0-1. It takes some
+minutes. Dev and test episodes are not used.
+"""
+
+import importlib.util
+from itertools import product
+from pathlib import Path
+from types import ModuleType
+
+import eitbench
+
+SEEDS = "train:0-1"
+BASELINES = Path(__file__).resolve().parent.parent / "baselines"
+GRIDS: dict[str, dict[str, tuple[float, ...]]] = {
+    "random_walk_filter": {"LENGTH": (0.01, 0.014, 0.02, 0.028), "STEP": (0.01, 0.02, 0.03, 0.06)},
+    "temporal_regularisation": {"LENGTH": (0.01, 0.014, 0.02), "STD": (0.05, 0.1, 0.15),
+                                "GAMMA": (0.6, 0.7, 0.8)}}
+"""Method -> constant -> its values."""
+
+
+def load(name: str) -> ModuleType:
+    """Return the module of a built-in method."""
+    spec = importlib.util.spec_from_file_location(name, BASELINES / f"{name}.py")
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def main() -> None:
+    for name, grid in GRIDS.items():
+        module = load(name)
+        errors = {}
+        for values in product(*grid.values()):
+            vars(module).update(zip(grid, values, strict=True))
+            table = eitbench.evaluate(module.Estimator, "eitbench/Pipe2D-v0", SEEDS)
+            errors[values] = table["error"].mean()
+            print(name, dict(zip(grid, values, strict=True)), f"{errors[values]:.5f}", flush=True)
+        print("best:", name, dict(zip(grid, min(errors, key=errors.__getitem__), strict=True)))
+
+
+if __name__ == "__main__":
+    main()

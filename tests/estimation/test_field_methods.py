@@ -1,0 +1,132 @@
+"""The field's usual methods agree with dense formulas and scipy's minimisers: difference images, total variation,
+temporal regularisation, the random walk and back-projection."""
+
+import numpy as np
+import pytest
+import scipy.optimize
+from eitbench import make_task
+from eitbench.bench.methods import load_method
+from eitbench.estimation import best_homogeneous, noser_prior, one_step, smoothness_covariance, total_variation
+from eitbench.numerics.mesh import rectangle_mesh
+from eitbench.worlds.catalogue import PIPE_2D
+from test_gauss_newton import Linear, small_tank
+
+
+@pytest.mark.parametrize("power", [0.0, 0.5, 1.0])
+def test_a_difference_image_is_the_penalised_least_squares_solution(power):
+    """Missing readings are left out: the image is (AᵀA + Γ⁻¹)⁻¹Aᵀr of the others."""
+    n, model = small_tank()
+    rng, start = np.random.default_rng(0), np.full(small_tank()[0], 30.0)
+    currents = np.array([[1.0, -1.0, 0.0, 0.0], [0.0, 1.0, 0.0, -1.0]])
+    computed, jacobian = model.linearise(start, currents)
+    voltages, std = computed + rng.normal(size=(2, 4)), rng.uniform(0.5, 2.0, (2, 4))
+    voltages[1, 2] = np.nan
+    kept = np.isfinite(voltages)
+    A, r = (jacobian / std[:, :, None])[kept], ((voltages - computed) / std)[kept]
+    precision = 0.01 * np.diag((A**2).sum(axis=0)**power)
+    expected = start + np.linalg.solve(A.T @ A + precision, A.T @ r)
+    found = one_step(model, voltages, currents, std, noser_prior(0.1, power), start)
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-8 * np.abs(expected - start).max())
+    assert n == len(found)
+
+
+def test_total_variation_is_the_minimum_of_its_objective():
+    """For a linear model scipy finds the same minimum; a step is sharper than with a quadratic penalty."""
+    mesh = rectangle_mesh(np.linspace(0.0, 1.0, 9), np.linspace(0.0, 1.0, 9))
+    rng, n, alpha, beta = np.random.default_rng(1), mesh.n_nodes, 2.0, 0.1
+    truth = np.where(mesh.points[:, 0] > 0.5, 2.0, 1.0)
+    J = rng.normal(size=(5, 12, n))
+    voltages, std = J @ truth, np.full((5, 12), 0.3)
+    corners = mesh.points[mesh.cells]
+    edges = np.linalg.inv(corners[:, 1:] - corners[:, :1])
+
+    def objective(c):
+        gradient = np.einsum("tij,tj->ti", edges, c[mesh.cells][:, 1:] - c[mesh.cells][:, :1])
+        variation = mesh.volumes @ np.sqrt((gradient**2).sum(axis=1) + beta**2)
+        return (((voltages - J @ c) / std)**2).sum() + alpha * variation
+
+    # the quadratic form of lagged diffusivity at its own image is the total variation, with twice its gradient
+    found = total_variation(Linear(J), voltages, np.zeros((5, 12)), std, mesh, alpha / 2, beta, np.ones(n), 100)
+    expected = scipy.optimize.minimize(objective, truth, method="L-BFGS-B", options={"maxiter": 5000, "maxfun": 10**6})
+    assert objective(found) == pytest.approx(expected.fun, rel=2e-3)
+    assert np.abs(found - expected.x).max() < 0.03
+
+
+def recorded(n_steps):
+    """Return the task of the 2D pipe and measurements of a wrong, varying concentration."""
+    task = make_task(PIPE_2D)
+    rng, n = np.random.default_rng(2), task.mesh.n_nodes
+    currents = task.currents[np.arange(n_steps) % len(task.currents)]
+    clean = task.observation.voltages(28.0 + 2.0 * np.sin(20.0 * task.mesh.points[:, 0]), currents)
+    return task, clean + task.noise.std(clean) * rng.normal(size=clean.shape), currents, n
+
+
+def test_temporal_regularisation_conditions_one_gaussian_of_all_states():
+    """Mean and variance are those of the stacked states with covariance γ^|i−j| Γ, given the window and its NaN."""
+    n_steps = 20
+    task, voltages, currents, n = recorded(n_steps)
+    voltages[7, 3] = np.nan
+    method = load_method("temporal_regularisation", "estimation")
+    estimator = method.make(task)
+    module = type(estimator).update.__globals__
+    for V, I in zip(voltages, currents, strict=True):
+        estimate = estimator.update(V, I)
+    first = task.calibration
+    c_ref = best_homogeneous(task.observation, task.noise, n, voltages[:first], currents[:first],
+                             task.expected_concentration)
+    computed, jacobian = task.observation.linearise(np.full(n, c_ref), currents)
+    prior = smoothness_covariance(task.mesh, module["LENGTH"], module["STD"] * c_ref)
+    window = np.arange(n_steps - module["WINDOW"], n_steps)
+    kept = np.isfinite(voltages[window])
+    H, S, R = jacobian[window][kept], [], np.diag(task.noise.std(computed)[window][kept]**2)
+    times = np.repeat(window, kept.sum(axis=1))
+    decay = module["GAMMA"]**np.abs(times[:, None] - times)
+    S = decay * (H @ prior @ H.T) + R
+    cross = module["GAMMA"]**(n_steps - 1.0 - times)[:, None] * (H @ prior)
+    residual = (voltages - computed)[window][kept]
+    np.testing.assert_allclose(estimate.mean, c_ref + np.linalg.solve(S, residual) @ cross, rtol=1e-9)
+    expected = prior.diagonal() - (cross * np.linalg.solve(S, cross)).sum(axis=0)
+    np.testing.assert_allclose(estimate.variance, expected, rtol=1e-8)
+
+
+def test_random_walk_filter_conditions_one_gaussian_of_all_states():
+    """Mean and variance are those of x_0 + Σ e_i, with a Matérn covariance of x_0 and each e_i."""
+    task, voltages, currents, n = recorded(18)
+    estimator = load_method("random_walk_filter", "estimation").make(task)
+    module = type(estimator).__init__.__globals__
+    for V, I in zip(voltages, currents, strict=True):
+        estimate = estimator.update(V, I)
+    c_ref = best_homogeneous(task.observation, task.noise, n, voltages[:task.calibration], currents[:task.calibration],
+                             task.expected_concentration)
+    computed, jacobian = task.observation.linearise(np.full(n, c_ref), currents)
+    step = smoothness_covariance(task.mesh, module["LENGTH"], module["STEP"] * c_ref)
+    initial = smoothness_covariance(task.mesh, module["LENGTH"], module["INITIAL_STD"] * c_ref)
+    steps = np.arange(1, len(voltages) + 1)
+    H, times = jacobian.reshape(-1, n), np.repeat(steps, voltages.shape[1])
+    shared = np.minimum(times[:, None], times)
+    S = H @ initial @ H.T + shared * (H @ step @ H.T) + np.diag(task.noise.std(computed).ravel()**2)
+    cross = H @ initial + times[:, None] * (H @ step)
+    solution = np.linalg.solve(S, (voltages - computed).ravel())
+    np.testing.assert_allclose(estimate.mean, c_ref + solution @ cross, rtol=1e-8)
+    expected = (initial + len(voltages) * step).diagonal() - (cross * np.linalg.solve(S, cross)).sum(axis=0)
+    np.testing.assert_allclose(estimate.variance, expected, rtol=1e-7)
+
+
+def last_estimate(method, task, voltages, currents):
+    """Return the estimate after the last measurement."""
+    estimator = load_method(method, "estimation").make(task)
+    for V, I in zip(voltages, currents, strict=True):
+        estimate = estimator.update(V, I)
+    return estimate.mean
+
+
+@pytest.mark.parametrize("method", ["back_projection", "noser", "total_variation", "gauss_newton"])
+def test_images_of_a_frame(method):
+    """Voltages of 28 mol/m³ give 28 everywhere, also if one is missing; an inclusion is where the image is largest."""
+    task, _, currents, n = recorded(16)
+    clean = task.observation.voltages(np.full(n, 28.0), currents)
+    clean[3, 5] = np.nan
+    np.testing.assert_allclose(last_estimate(method, task, clean, currents), 28.0, rtol=1e-6)
+    distance = np.linalg.norm(task.mesh.points - task.mesh.points.mean(axis=0) - [0.05, 0.03], axis=1)
+    voltages = task.observation.voltages(28.0 + 6.0 * np.exp(-(distance / 0.02)**2), currents)
+    assert distance[np.argmax(last_estimate(method, task, voltages, currents))] < 0.03
