@@ -26,7 +26,12 @@ COLUMNS = {
 ASSUMPTIONS = {
     "homogeneous": ("–", "one constant"),
     "persistence": ("at rest for a frame", "smooth"),
+    "back_projection": ("at rest for a frame", "–"),
+    "noser": ("at rest for a frame", "independent nodes"),
     "gauss_newton": ("at rest for a frame", "smooth"),
+    "total_variation": ("at rest for a frame", "sharp edges"),
+    "temporal_regularisation": ("correlated in time", "smooth"),
+    "random_walk_filter": ("random walk", "smooth"),
     "map_estimate": ("at rest", "smooth"),
     "log_map": ("at rest", "smooth, positive"),
     "log_walk_filter": ("random walk", "smooth, positive"),

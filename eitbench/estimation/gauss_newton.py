@@ -11,7 +11,6 @@ import scipy.sparse as sp
 from scipy.linalg import cho_factor, cho_solve, lu_factor, lu_solve
 
 from eitbench.estimation.nodal import initial_covariance
-from eitbench.numerics.fem import diffusivity_matrix
 from eitbench.numerics.sparse_lu import SparseLU
 from eitbench.worlds.task import Estimate
 
@@ -114,11 +113,13 @@ def noser_prior(strength: float, power: float) -> Callable[[np.ndarray], np.ndar
 def total_variation(model: VoltageModel, voltages: np.ndarray, currents: np.ndarray,
                     noise_std: np.ndarray, mesh: Mesh, alpha: float, smoothing: float,
                     start: np.ndarray, n_iterations: int = 10) -> np.ndarray:
-    """Return argmin_c ‖(V − U(c))/std‖² + α ∫√(|∇c|² + β²), by lagged diffusivity (Vogel & Oman
+    """Return argmin_c ‖(V − U(c))/std‖² + 2 α ∫√(|∇c|² + β²), by lagged diffusivity (Vogel & Oman
     1996): each iteration is a Gauss–Newton step with the penalty of the last image.
 
     Arguments as in `gauss_newton`; ``alpha`` is in m^(1-d)/(mol/m³), ``smoothing`` β in mol/m⁴.
     """
+    # lazy import: other estimators do not need finite elements
+    from eitbench.numerics.fem import diffusivity_matrix
     c = start
     for _ in range(n_iterations):
         penalty = alpha * diffusivity_matrix(mesh, c, smoothing)
