@@ -3,8 +3,8 @@ stationary target (thesis 5.11).
 
 In the filtering subtrack, the frame consists of the latest 16 injections; in the smoothing subtrack
 each state gets the image of the frame that contains it, as in the thesis (Fig. 5.6). ALPHA was
-tuned once, on stationary targets from the training seeds, by `studies/tune_reconstruction.py`, to the
-smallest mean error on a grid of two values per octave.
+tuned once, on stationary targets from the training seeds, by `studies/tune_reconstruction.py`, to
+the smallest mean error on a grid of two values per octave.
 """
 
 from eitbench import Task

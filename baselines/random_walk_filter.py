@@ -1,9 +1,10 @@
-"""Kalman filter with a random walk, F = I: the field's default where the flow is unknown (Vauhkonen,
+"""Kalman filter with a random walk, F = I: the usual method where the flow is unknown (Vauhkonen,
 Karjalainen & Kaipio 1998).
 
-The concentration changes by an independent Matérn field in each time step. It has the correlation
-LENGTH and the standard deviation STEP ĉ_bh, the initial state INITIAL_STD ĉ_bh; chosen on training episodes by
-`studies/tune_random_walk.py`; voltages are linearised about ĉ_bh.
+The concentration changes by an independent Matérn field in each time step, with the correlation
+LENGTH and the standard deviation STEP ĉ_bh. The initial state has the same correlation and the
+standard deviation INITIAL_STD ĉ_bh. Voltages are linearised about ĉ_bh. LENGTH and STEP were chosen
+on training episodes by `studies/tune_random_walk.py`.
 """
 
 from dataclasses import replace

@@ -1,10 +1,10 @@
-"""Temporal regularisation: one-step difference images of a window of measurements, with a prior that
-is correlated in space and time (Adler, Dai & Lionheart 2007).
+"""Temporal regularisation: one-step difference images of a window of measurements, with a prior
+that is correlated in space and time (Adler, Dai & Lionheart 2007).
 
 The deviation from ĉ_bh has the covariance γ^|i−j| Γ of time steps i and j, with Γ a Matérn
-covariance. The window has the last WINDOW measurements and, with a lag, as many later ones. For a
-window over all measurements this is the Kalman smoother with F = γ I. The constants were chosen on
-training episodes by `studies/tune_random_walk.py`.
+covariance. The window has the last WINDOW measurements and, with a lag, up to WINDOW − 1 later
+ones. For a window over all measurements this is the Kalman smoother with F = γ I. The constants
+were chosen on training episodes by `studies/tune_random_walk.py`.
 """
 
 import numpy as np

@@ -86,9 +86,9 @@ from eitbench.estimation.velocity import (
 
 __all__ = [
     "CalibrationFrame", "DenseCovariance", "EnsembleFilter", "Filter", "FilterEstimator",
-    "FilterFeatures", "FrameEstimator", "IdentifiedModel", "ImpulseResponse", "InflowPrior", "InflowWindow",
-    "LinearMeasurement", "LinearisedForwardModel", "LogStates", "LowRankCovariance", "Motion",
-    "NetworkCorrectedFilter", "NodalStates", "OpenLoopCovariance", "ParticleInflowFilter",
+    "FilterFeatures", "FrameEstimator", "IdentifiedModel", "ImpulseResponse", "InflowPrior",
+    "InflowWindow", "LinearMeasurement", "LinearisedForwardModel", "LogStates", "LowRankCovariance",
+    "Motion", "NetworkCorrectedFilter", "NodalStates", "OpenLoopCovariance", "ParticleInflowFilter",
     "QuadraticVoltageModel", "RecordSmoother", "Regimes", "ScaledVoltageModel", "StateSpace",
     "StationaryMap", "Step", "SwitchingInflowFilter", "UnscentedFilter", "VelocityInflowWindow",
     "VelocityPrior", "VelocityStates", "VoltageFeatures", "apply_correction", "best_homogeneous",
@@ -97,8 +97,8 @@ __all__ = [
     "gauss_newton", "gru_step", "identify_model", "inflow_filter", "initial_covariance",
     "initial_hidden_state", "innovate", "kalman_filter", "linearise_at_prediction",
     "linearise_at_reference", "linearise_voltages", "load_network", "map_inflow",
-    "maximise_posterior", "noser_prior", "one_step", "modal_states", "network_matches_task", "nodal_filter", "nodal_states",
-    "reduced_response", "scaled_velocity_prior", "smooth_means", "smooth_state",
-    "smoothness_covariance", "steady_response", "table_5_1_filter", "task_velocity_prior",
-    "time_varying_responses", "total_variation", "velocity_states",
+    "maximise_posterior", "modal_states", "network_matches_task", "nodal_filter", "nodal_states",
+    "noser_prior", "one_step", "reduced_response", "scaled_velocity_prior", "smooth_means",
+    "smooth_state", "smoothness_covariance", "steady_response", "table_5_1_filter",
+    "task_velocity_prior", "time_varying_responses", "total_variation", "velocity_states",
 ]

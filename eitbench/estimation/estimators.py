@@ -12,9 +12,8 @@ from eitbench.worlds.task import Estimate, Task
 
 Measurement = tuple[np.ndarray, np.ndarray]
 """Voltages (L,) in V and currents (L,) in A (A/m in 2D) of one injection."""
-
-
 Reconstruction = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
+"""Function of the argument ``reconstruct`` of `FrameEstimator`."""
 
 
 class CalibrationFrame:
