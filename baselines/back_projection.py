@@ -1,8 +1,9 @@
-"""Linear back-projection: each node gets the mean of the relative changes of all voltages of a
-frame, weighted by their sensitivity to this node (Barber & Brown 1984; Xie et al. 1992).
+"""Linear back-projection: each node gets the weighted mean of the relative changes of all voltages
+of a frame (Barber & Brown 1984; Xie et al. 1992).
 
 The change of a voltage is relative to its change by a uniform concentration, so that a uniform
-change is reproduced. The image is qualitative: it is blurred over the vessel.
+change is reproduced. The weight is the sensitivity of the voltage to the node, multiplied by the
+precision of the relative change. The image is qualitative: it is blurred over the vessel.
 """
 
 import numpy as np
@@ -18,10 +19,11 @@ class Estimator(FrameEstimator):
         def reconstruct(V: np.ndarray, I: np.ndarray, start: np.ndarray) -> np.ndarray:
             computed, jacobian = task.observation.linearise(start, I)
             measured = np.isfinite(V)
-            S, change = jacobian[measured], (V - computed)[measured]
-            uniform = S.sum(axis=1)             # change of the voltages by a unit change of c
-            weight = np.abs(S) / task.noise.std(computed)[measured, None]**2
-            total = np.abs(uniform) @ weight
-            return start + np.sign(uniform) * change @ weight / np.where(total > 0.0, total, 1.0)
+            std = task.noise.std(computed)[measured]
+            sensitivity = np.abs(jacobian[measured]) / std[:, None]
+            uniform = jacobian[measured].sum(axis=1) / std    # change by a unit change of c
+            change = (V - computed)[measured] / std
+            total = uniform**2 @ sensitivity
+            return start + (uniform * change) @ sensitivity / np.where(total > 0.0, total, 1.0)
 
         super().__init__(task, reconstruct)

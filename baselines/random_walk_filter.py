@@ -14,9 +14,9 @@ from eitbench.estimation import FilterEstimator, linearise_at_reference, nodal_f
 from eitbench.estimation.walk import RandomWalk
 from eitbench.physics.stationary import StationaryTransport
 
-LENGTH = 0.028
+LENGTH = 0.113
 """m"""
-STEP = 0.01
+STEP = 0.005
 INITIAL_STD = 0.25
 
 

@@ -3,8 +3,8 @@ that is correlated in space and time (Adler, Dai & Lionheart 2007).
 
 The deviation from ĉ_bh has the covariance γ^|i−j| Γ of time steps i and j, with Γ a Matérn
 covariance. The window has the last WINDOW measurements and, with a lag, up to WINDOW − 1 later
-ones. For a window over all measurements this is the Kalman smoother with F = γ I. The constants
-were chosen on training episodes by `studies/tune_random_walk.py`.
+ones. For a window over all measurements this is the Kalman smoother with F = γ I. GAMMA, STD and
+LENGTH were chosen on training episodes by `studies/tune_random_walk.py`.
 """
 
 import numpy as np
@@ -13,10 +13,10 @@ from scipy.linalg import cho_factor, cho_solve, solve_triangular
 from eitbench import Estimate, Task
 from eitbench.estimation import CalibrationFrame, LinearisedForwardModel, smoothness_covariance
 
-GAMMA = 0.7
-STD = 0.3
+GAMMA = 0.8
+STD = 0.1
 """Standard deviation of c, relative to ĉ_bh."""
-LENGTH = 0.02
+LENGTH = 0.014
 """m"""
 WINDOW = 16
 

@@ -1,7 +1,8 @@
 """Tables of the environments and of the built-in estimators in docs/.
 
-`python studies/document_tables.py` writes them into docs/environments.md and docs/estimators.md,
-from the registered environments and leaderboards/leaderboard.csv, in half a minute.
+`python studies/document_tables.py` writes them into docs/environments.md, docs/estimators.md and
+docs/methods.md, from the registered environments and leaderboards/leaderboard.csv, in half a
+minute.
 """
 
 from pathlib import Path
@@ -23,6 +24,9 @@ COLUMNS = {
     "Pipe3D": "3D", "Pipe3DSmoothing": "3D smoothing", "RotatingTank2D": "rotating",
     "StationaryTank2D": "stationary"}
 """Environment -> column of the table of estimators."""
+WITHOUT_FLOW = ("back_projection", "noser", "total_variation", "gauss_newton",
+                "random_walk_filter", "temporal_regularisation")
+THESIS = ("kalman_filter", "fixed_lag_smoother", "fixed_interval_smoother")
 ASSUMPTIONS = {
     "homogeneous": ("–", "one constant"),
     "persistence": ("at rest for a frame", "smooth"),
@@ -106,11 +110,16 @@ def space(of: gym.Space) -> str:
     return f"{np.prod(of.shape)} numbers"
 
 
-def estimators() -> str:
-    """Return the table of all built-in estimators: assumptions, cost and errors."""
+def leaderboard() -> pd.DataFrame:
+    """Return the rows of leaderboard.csv, with the base names of environments."""
     scores = pd.read_csv(ROOT / "leaderboards" / "leaderboard.csv")
     scores = scores[scores["environment"] != "all"]
-    scores = scores.assign(environment=scores["environment"].map(base_name))
+    return scores.assign(environment=scores["environment"].map(base_name))
+
+
+def estimators() -> str:
+    """Return the table of all built-in estimators: assumptions, cost and errors."""
+    scores = leaderboard()
     rows = []
     for method, (flow, inflow) in ASSUMPTIONS.items():
         own = scores[scores["method"] == method].set_index("environment").reindex(COLUMNS)
@@ -122,9 +131,25 @@ def estimators() -> str:
     return Table.of(rows).markdown()
 
 
+def methods() -> str:
+    """Return the table of the errors without a flow model, with the thesis' and the best one."""
+    scores = leaderboard()
+    rows = []
+    for id in COLUMNS:
+        own = scores[scores["environment"] == id].set_index("method")
+        best = own.loc[own["rank"].notna(), "error"].idxmin()
+        errors = {name.replace("_", " "): own["error"].get(name, np.nan) for name in WITHOUT_FLOW}
+        errors |= {"thesis": own["error"].reindex(THESIS).dropna().iloc[0],
+                   "best": own["error"][best]}
+        rows.append({"environment": id, **{name: number_cell(1e4 * error)
+                                           for name, error in errors.items()}, "best method": best})
+    return Table.of(rows).markdown()
+
+
 def main() -> None:
-    """Write both tables between their markers."""
-    for name, made in (("environments", environments()), ("estimators", estimators())):
+    """Write the tables between their markers."""
+    for name, made in (("environments", environments()), ("estimators", estimators()),
+                       ("methods", methods())):
         path = ROOT / "docs" / f"{name}.md"
         before, rest = path.read_text(encoding="utf-8").split("<!-- table -->\n")
         after = rest.partition("\n<!-- end -->")[2]

@@ -43,7 +43,7 @@ def test_links_lead_somewhere(page):
         assert not anchor or anchor in anchors(there), target
 
 
-@pytest.mark.parametrize("page", ["estimators", pytest.param("environments", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("page", ["estimators", "methods", pytest.param("environments", marks=pytest.mark.slow)])
 def test_table_is_current(page):
     """The table of a page is what `studies/document_tables.py` makes, with a row for each estimator."""
     import document_tables
