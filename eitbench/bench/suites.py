@@ -22,8 +22,8 @@ from eitbench.bench.run import Job
 from eitbench.bench.runner import cached_environment, is_compatible
 from eitbench.bench.tracks import Environment
 
-TOO_SLOW_FOR_QUICK = {("filter", "gauss_newton")}
-"""Subtrack and method that the quick suite skips: an episode takes minutes."""
+TOO_SLOW_FOR_QUICK = {("filter", "gauss_newton"), ("filter", "total_variation")}
+"""Subtracks and methods that the quick suite skips: an episode takes minutes."""
 
 
 def make_jobs(track: str, environments: list[str], methods: list[str],

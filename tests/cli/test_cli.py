@@ -95,7 +95,7 @@ def test_every_subtrack_by_default(tmp_path):
 
 
 def test_suites():
-    """full has every environment; quick the plain pipe with fewer seeds, without the method that takes minutes. Methods
+    """full has every environment; quick the plain pipe with fewer seeds, without methods that take minutes. Methods
     fitted to a real pipe are incompatible with tiny worlds."""
     quick, full = (suites.make_jobs("estimation", [], [], [1], suite=suite) for suite in ("quick", "full"))
     plain = set(PLAIN) & set(ids("estimation"))
@@ -104,7 +104,8 @@ def test_suites():
     real_only = {"approximation_error_filter", "identified_flow", "real_time_filter"}
     real_only |= {name for name in builtin_methods("estimation") if name.startswith("learned_")}
     missing = {job for job in full if job.environment.id in plain} - set(quick)
-    assert missing == {suites.Job(suites.Environment(PIPE), "gauss_newton", 1)} and set(quick) < set(full)
+    assert missing == {suites.Job(suites.Environment(PIPE), name, 1) for name in ("gauss_newton", "total_variation")}
+    assert set(quick) < set(full)
     assert {job.method for job in full} == set(builtin_methods("estimation")) - real_only
     assert set(parse_seeds(tracks.QUICK_SEEDS)) < set(parse_seeds(entry(PIPE).test_seeds))
     assert min(parse_seeds(entry(PIPE).test_seeds)) == 200_000
