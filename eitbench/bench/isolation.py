@@ -95,8 +95,7 @@ def choose_isolation(environment: Environment, method: str, isolate: str = "auto
     measurements from the file. ``ValueError`` if the value is invalid, bubblewrap is required and
     does not work, or with ``strict`` a third-party file would run in this process.
     """
-    if isolate not in ISOLATE:
-        raise ValueError(f"isolate must be one of {', '.join(ISOLATE)}, got {isolate!r}")
+    _check.choice("isolate", isolate, ISOLATE)
     third_party = not is_builtin(method)
     if is_measured(environment.id):
         if strict and third_party and isolate != "none":

@@ -269,13 +269,11 @@ def find_method(name: str, track: str) -> Path:
         path = resolve_input(Path(name))
     else:
         known = installed_methods() | {each: folder / f"{each}.py" for each in own}
-        path = known.get(name, Path())
+        _check.choice(f"{form.kind}, if not the path of {form.files},", name, known)
+        path = known[name]
     if not path.is_file():
-        names = [*own, *installed_methods()]
-        hint = (f": {AGENTS_NOT_BUNDLED}" if "checkpoints" in path.parts
-                else _check.did_you_mean(name, names))
-        raise ValueError(f"{form.kind} must be the path of {form.files}, or one of "
-                         f"{', '.join(names)}; got {name!r}{hint}")
+        hint = f": {AGENTS_NOT_BUNDLED}" if "checkpoints" in path.parts else ""
+        raise ValueError(f"{form.kind} {path} does not exist, or is not a file{hint}")
     if path.stat().st_size > MAX_METHOD_BYTES:
         raise ValueError(f"{form.kind} {path} must have {MAX_METHOD_BYTES >> 20} MiB at most")
     if path.stem in own and not path.samefile(folder / f"{path.stem}.py"):

@@ -116,9 +116,7 @@ class Score:
         if not self.name.isidentifier() or self.name != self.name.lower() or self.name[0] == "_":
             raise ValueError("name must be of lower-case letters, digits and underscores, got "
                              f"{self.name!r}")
-        if self.direction not in SCORE_DIRECTIONS:
-            raise ValueError(f"direction must be one of {', '.join(SCORE_DIRECTIONS)}, got "
-                             f"{self.direction!r}")
+        _check.choice("direction", self.direction, SCORE_DIRECTIONS)
         for argument, values, allowed in (("requires", self.requires, Outcome.__dataclass_fields__),
                                           ("tracks", self.tracks, KINDS)):
             if unknown := [each for each in values if each not in allowed]:

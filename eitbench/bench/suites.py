@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from eitbench import _check
 from eitbench.bench import tracks
 from eitbench.bench.isolation import choose_isolation
 from eitbench.bench.methods import (
@@ -39,9 +40,7 @@ def make_jobs(track: str, environments: list[str], methods: list[str],
     `isolation.choose_isolation`. ``ValueError`` if an environment or method is unknown, a given
     method is compatible with none of the environments, or two methods have the same name.
     """
-    if estimator not in tracks.ONBOARD_FILTERS:
-        raise ValueError(f"estimator must be one of {', '.join(tracks.ONBOARD_FILTERS)}, got "
-                         f"{estimator!r}")
+    _check.choice("estimator", estimator, tracks.ONBOARD_FILTERS)
     given = {} if estimator == "full" else {"estimator": estimator}
     for method in methods:
         find_method(method, track)

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import gymnasium as gym
 from gymnasium.envs.registration import load_env_creator
 
+from eitbench import _check
 from eitbench.data.seeds import parse_seeds
 from eitbench.worlds.registry import entries, entry
 
@@ -81,9 +82,7 @@ class Environment(NamedTuple):
         """Make the environment without gymnasium's wrappers; ``ValueError`` if the id is unknown or
         an argument is invalid."""
         arguments = RUN_KWARGS[self.track] | json.loads(self.kwargs) | extra
-        if arguments.get("estimator", "full") not in ONBOARD_FILTERS:
-            raise ValueError(f"estimator must be one of {', '.join(ONBOARD_FILTERS)}, got "
-                             f"{arguments['estimator']!r}")
+        _check.choice("estimator", arguments.get("estimator", "full"), ONBOARD_FILTERS)
         made: Any = gym.make(self.id, disable_env_checker=True, **arguments).unwrapped
         return made
 
@@ -177,9 +176,7 @@ def subtracks_of(id: str, kwargs: dict[str, Any]) -> tuple[str, ...]:
     track = track_of(id)
     known = _parameters(id) if kwargs else ()
     for name, value in kwargs.items():
-        if name not in known:
-            raise ValueError(f"{name} is not an argument of {id}; it must be one of "
-                             f"{', '.join(known)}")
+        _check.choice(f"argument of {id}", name, known)
         if name in ("world", "assume") and not isinstance(value, dict | None):
             raise ValueError(f"{name} must be an object, got {type(value).__name__}")
     if track == "injection":

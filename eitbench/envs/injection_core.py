@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from gymnasium import spaces
 
+from eitbench import _check
 from eitbench.data.episode_cache import instrument_faults, integrals, score_mass, scoring_constants
 from eitbench.envs.episodes import EpisodeCore, Observation
 from eitbench.estimation.onboard.episode_filters import Innovation
@@ -65,9 +66,7 @@ class InjectionCore(EpisodeCore):
 
     def __init__(self, rules: Rules, estimator: str, observation: str = "raw") -> None:
         super().__init__(rules.world)
-        if observation not in OBSERVATION_FORMATS:
-            raise ValueError(f"observation must be one of {', '.join(OBSERVATION_FORMATS)}, "
-                             f"got {observation!r}")
+        _check.choice("observation", observation, OBSERVATION_FORMATS)
         self.rules = rules
         self._filters_type = filters_class(rules, estimator)
         self._is_scaled = observation == "scaled" and self._filters_type is not None

@@ -45,8 +45,7 @@ def read(path: Path | str, format: str | None = None, steps: slice | None = None
     if not path.exists():
         raise ValueError(f"{path} must be a file or a folder, got a missing path")
     format = format or _detect_format(path)
-    if format not in READERS:
-        raise ValueError(f"format must be one of {', '.join(READERS)}, got {format!r}")
+    _check.choice("format", format, READERS)
     if format == "table" and "electrodes" not in options:
         options = _table_options(path) | options
     names = set(signature(READERS[format]).parameters) - {"path", "steps"}
@@ -212,8 +211,8 @@ def read_table(path: Path, *, electrodes: int, current: float, time_step: float 
         A voltage is the potential of its electrode, or its difference from the next electrode.
         Default: differences if all their titles are such as ``U1-U2``.
     """
-    if readings not in (None, *TABLE_VOLTAGES):
-        raise ValueError(f"readings must be one of {', '.join(TABLE_VOLTAGES)}, got {readings!r}")
+    if readings is not None:
+        _check.choice("readings", readings, TABLE_VOLTAGES)
     L = _check.integer("electrodes", electrodes, low=2)
     _check.number("current", current, low=0.0, open_low=True, units="A")
     _check.number("time_step", time_step, low=0.0, open_low=True, units="s")

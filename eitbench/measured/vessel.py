@@ -78,9 +78,7 @@ class VesselConfig:
     def __post_init__(self) -> None:
         _check.number("first", self.first_electrode_deg, units="degrees")
         _check.number("depth", self.depth, low=0.0, open_low=True, units="m")
-        if self.direction not in NUMBERING_DIRECTIONS:
-            raise ValueError(f"direction must be one of {', '.join(NUMBERING_DIRECTIONS)}, "
-                             f"got {self.direction!r}")
+        _check.choice("direction", self.direction, NUMBERING_DIRECTIONS)
         if self.conductivity is not None:
             _check.number("conductivity", self.conductivity, low=0.0, open_low=True, units="S/m")
         if self.flow and self.flow.is_estimated and not isinstance(self.shape, PlanePipe):
@@ -141,8 +139,7 @@ def read_vessel(source: Path | str | Mapping[str, Any]) -> VesselConfig:
     else:
         entries, folder = load_yaml(Path(source), "vessel"), Path(source).parent
     kind = entries.pop("kind", None)
-    if kind not in VESSEL_ENTRIES:
-        raise ValueError(f"vessel.kind must be one of {', '.join(VESSEL_ENTRIES)}, got {kind!r}")
+    _check.choice("vessel.kind", kind, VESSEL_ENTRIES)
     required, optional = VESSEL_ENTRIES[kind]
     if missing := sorted(required - set(entries)):
         raise ValueError(f"vessel of kind {kind} must have {', '.join(missing)}")

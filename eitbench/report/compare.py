@@ -103,9 +103,7 @@ def mean_over_trainings(records: list[dict[str, Any]]) -> list[dict[str, Any]]:
 def resolve_score(name: str) -> Score:
     """Return the score of this name; ``ValueError`` if none has a better direction."""
     known = {each.name: each for each in scores().values() if each.direction in ("lower", "higher")}
-    if name not in known:
-        raise ValueError(f"score must be one of {', '.join(known)}; got {name!r}"
-                         + _check.did_you_mean(name, known))
+    _check.choice("score", name, known)
     return known[name]
 
 

@@ -50,7 +50,7 @@ from eitbench.envs.injection import InjectionEnv, InjectionVectorEnv
 from eitbench.rl.imitation import check_imitation, imitate, load_compatible_policy, rollout
 from eitbench.rl.networks import MaskablePairPolicy, PairPolicy
 from eitbench.rl.vec_env import InjectionVecEnv
-from eitbench.worlds.registry import entries, entry
+from eitbench.worlds.registry import entries
 
 ALGORITHMS: dict[str, type[BaseAlgorithm]] = {
     "ppo": PPO, "dqn": DQN, "sac": SAC, "recurrent_ppo": RecurrentPPO,
@@ -158,8 +158,7 @@ def train(env: str, algo: str, config: TrainingConfig, seed: int, folder: Path,
     kwargs : dict, optional
         Arguments of the environment.
     """
-    if algo not in ALGORITHMS:
-        raise ValueError(f"algo must be one of {', '.join(ALGORITHMS)}, got {algo!r}")
+    _check.choice("algo", algo, ALGORITHMS)
     seed = _check.integer("seed", seed, low=0)
     envs = vector_env(env, kwargs, config)
     asked = {"env": env, "kwargs": kwargs or {}, "algo": algo, "seed": seed,
@@ -214,9 +213,7 @@ def vector_env(env: str, kwargs: dict[str, Any] | None, config: TrainingConfig,
                n_envs: int | None = None) -> InjectionVectorEnv:
     """Build the vector environment; ``ValueError`` if ``env`` is not an injection environment, or
     ``kwargs`` hold arguments that training sets."""
-    if entry(env).track != "injection":
-        known = [id for id, each in entries().items() if each.track == "injection"]
-        raise ValueError(f"env must be one of {', '.join(known)}; got {env!r}")
+    _check.choice("env", env, [id for id, each in entries().items() if each.track == "injection"])
     if taken := {"episodes", "observation", "estimator"} & set(kwargs or {}):
         raise ValueError("kwargs must not hold episodes, an entry of the configuration, nor "
                          "observation and estimator, which training sets; "

@@ -53,9 +53,7 @@ class PipeFlow(Flow):
         mean = _check.number("assume.mean_velocity", self.mean_velocity if mean is None else mean,
                              low=0.0, units="m/s")
         profile = assumed.get("profile") or "parabolic"
-        if profile not in PROFILES:
-            known = ", ".join(PROFILES)
-            raise ValueError(f"assume.profile must be one of {known}, got {profile!r}")
+        _check.choice("assume.profile", profile, PROFILES)
         if profile == "plug":
             return PlugFlow(mean)
         if profile == "power-law":
@@ -208,9 +206,7 @@ class FlowPastBulge(PipeFlow):
     def check_assumed(self, world: World, assumed: Mapping[str, Any]) -> None:
         """Accept ``flow``, one of `BULGE_FLOW_ASSUMPTIONS`."""
         reject_unknown_assumptions(assumed, ("flow",))
-        if (flow := assumed.get("flow", "parabolic")) not in BULGE_FLOW_ASSUMPTIONS:
-            known = ", ".join(BULGE_FLOW_ASSUMPTIONS)
-            raise ValueError(f"assume.flow must be one of {known}, got {flow!r}")
+        _check.choice("assume.flow", assumed.get("flow", "parabolic"), BULGE_FLOW_ASSUMPTIONS)
 
     def assumed_velocity(self, world: World, **assumed: Any) -> VelocityField:
         self.check_assumed(world, assumed)

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from eitbench import _check
 from eitbench.estimation.onboard.episode_filters import EpisodeFilters
 from eitbench.estimation.onboard.full_filters import FullFilters
 from eitbench.estimation.onboard.reduced_filters import ReducedFilters
@@ -22,9 +23,7 @@ FAULT_EMA_WEIGHT = 0.2
 def filters_class(rules: Rules, estimator: str) -> type[EpisodeFilters] | None:
     """Return the class for a name, None for "none"; ``ValueError`` if it does not exist for these
     rules."""
-    if estimator not in ESTIMATOR_OPTIONS:
-        raise ValueError(f"estimator must be one of {', '.join(ESTIMATOR_OPTIONS)}, "
-                         f"got {estimator!r}")
+    _check.choice("estimator", estimator, ESTIMATOR_OPTIONS)
     if estimator == "none":
         return None
     if rules.inflow == "learned":
