@@ -273,7 +273,8 @@ def _load(track: str, id: str, kwargs: str, method: str, isolation: str, path: P
     try:
         worker.start()
     except WorkerError as error:
-        raise ValueError(f"{path} cannot be loaded: {error}") from None
+        raise ValueError(f"{path} cannot be loaded: {str(error).removeprefix('ValueError: ')}"
+                         ) from None
     about = worker.about
     if path.suffix == ".py":
         about["name"] = path.stem  # a worker may report any name

@@ -220,7 +220,7 @@ def method_files(path: Path) -> dict[str, bytes]:
         file = path.with_name(name) if name == Path(name).name else Path()
         if not file.is_file():
             raise ValueError(f"{path}: files must name files in the folder of the method, got "
-                             f"{name!r}")
+                             f"{name!r}, which does not exist there")
         if file.stat().st_size > MAX_METHOD_BYTES:
             raise ValueError(f"{file} must have {MAX_METHOD_BYTES >> 20} MiB at most")
         contents[name] = file.read_bytes()

@@ -242,14 +242,10 @@ def _lineage(record: dict[str, Any]) -> tuple[str, ...]:
 # -- checks -------------------------------------------------------------------------------------
 
 
-def schema_text() -> str:
-    """Return the published schema."""
-    return (bundled_path("leaderboards") / "schema.json").read_text(encoding="utf-8")
-
-
 @lru_cache(maxsize=1)
 def _validator() -> Any:
-    return jsonschema_rs.validator_for(json.loads(schema_text()))
+    schema = bundled_path("leaderboards") / "schema.json"
+    return jsonschema_rs.validator_for(json.loads(schema.read_text(encoding="utf-8")))
 
 
 def check_record(record: Any) -> None:

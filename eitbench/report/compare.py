@@ -29,7 +29,7 @@ from eitbench.bench.statistics import (
 )
 from eitbench.bench.table import MISSING, Cell, Table, number_cell
 from eitbench.bench.text import format_interval, scores_by_seed
-from eitbench.bench.tracks import CATEGORIES, qualified_name
+from eitbench.bench.tracks import CATEGORIES, nominal_id, qualified_name
 from eitbench.report.boards import is_naive_baseline, record_category, skill_scores
 
 COMPARISON_FIELDS = ("environment", "score", "episodes", "a", "b", "advantage", "low", "high",
@@ -38,15 +38,18 @@ SKILL_SCORE = "skill score"
 """Score over several environments instead of the error, whose mean the largest error dominates."""
 BUNDLED_RECORDS = bundled_path("leaderboards") / "results"
 """Records of the package."""
+OWN_RECORDS = Path("results/records")
+"""Records of `eitbench run`."""
 MIN_VERSION_PREFIX = 4
 """Smallest number of leading sha256 digits that identify a version."""
 
 
 def find_records(name: str, folder: Path) -> list[dict[str, Any]]:
     """Return the records of a method from the path of one, or from METHOD or METHOD@VERSION within
-    a folder, otherwise among the bundled records. Without a version the newest, official ones
-    where there are any; a third-party version may be shortened to four digits. The name of an agent
-    without its training seed, such as ppo, is the mean over its trainings.
+    a folder, otherwise among the bundled records, otherwise in `OWN_RECORDS`. Without a version the
+    newest, official ones where there are any; a third-party version may be shortened to four
+    digits. The name of an agent without its training seed, such as ppo, is the mean over its
+    trainings.
 
     Raises
     ------
@@ -62,7 +65,7 @@ def find_records(name: str, folder: Path) -> list[dict[str, Any]]:
         return own == version or (shortened and own.startswith(version))
 
     known: set[str] = set()
-    for place in dict.fromkeys([folder.resolve(), BUNDLED_RECORDS.resolve()]):
+    for place in dict.fromkeys(map(Path.resolve, (folder, BUNDLED_RECORDS, OWN_RECORDS))):
         there = read_records(place)
         known |= {record["method"] for record in there}
         if not version:
@@ -120,8 +123,8 @@ def compare(a: list[dict[str, Any]], b: list[dict[str, Any]], score: str = "erro
     and rows for several of them together.
 
     For the error, the aggregate rows compare skill scores: ``all filter`` and so on, for each
-    category with several environments that have a baseline among ``zero``. For other scores there
-    is one row, ``all``.
+    category with several environments, none of them a shifted variant, that have a baseline among
+    ``zero``. For other scores there is one row, ``all``.
 
     Returns
     -------
@@ -152,7 +155,8 @@ def compare(a: list[dict[str, Any]], b: list[dict[str, Any]], score: str = "erro
             own, other = ({seed: each[seed] for seed in shared} for each in pair)
             both[label] = own, other
             level = levels.get(place, {})
-            if gained := skill_scores(level, own):
+            is_shifted = bool(nominal_id(record["environment"]["id"]))
+            if not is_shifted and (gained := skill_scores(level, own)):
                 gains[record_category(record)][label] = gained, skill_scores(level, other)
     if not both:
         also = f" with {score}" if score != "error" else ""

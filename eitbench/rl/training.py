@@ -164,10 +164,13 @@ def train(env: str, algo: str, config: TrainingConfig, seed: int, folder: Path,
     asked = {"env": env, "kwargs": kwargs or {}, "algo": algo, "seed": seed,
              "config": asdict(config)}
     settings, made, latest = (folder / name for name in ("config.json", "model.zip", "latest.zip"))
-    if settings.exists() and (there := json.loads(settings.read_text())) != json.loads(
-            json.dumps(asked)):
-        raise ValueError(
-            f"out must be an empty folder or one of the same run; {folder} holds {there}")
+    if settings.exists():
+        there, here = (each | each["config"] for each in (
+            json.loads(settings.read_text()), json.loads(json.dumps(asked))))
+        if differ := [name for name in here if name != "config" and there[name] != here[name]]:
+            found = ", ".join(f"{name} {there[name]}, not {here[name]}" for name in differ)
+            raise ValueError(f"out must be an empty folder or one of the same run; {folder} has "
+                             f"{found}")
     if made.exists() and (folder / "sha256").exists() and not latest.exists():
         return made
     world: Any = gym.make(env, disable_env_checker=True, observation="raw",
@@ -231,8 +234,7 @@ def policy_rewards(policy: str, world: InjectionEnv, path: Path) -> np.ndarray:
     rewards = np.array([
         rollout(world, method, episode, np.random.default_rng(episode))[2]
         for episode in tqdm(range(world.pool.max_episodes), desc=f"rewards of {policy}",
-                            unit="episode",
-                            disable=None)])
+                            unit="episode", disable=None)])
     write_atomically(path, npy(rewards))
     return rewards
 

@@ -9,6 +9,7 @@ import warnings
 import jsonschema
 import jsonschema_rs
 import pytest
+from eitbench._files import bundled_path
 from eitbench.bench.records import (
     BOARDS,
     MAX_BYTES,
@@ -16,7 +17,6 @@ from eitbench.bench.records import (
     read_record,
     read_records,
     record_file_name,
-    schema_text,
     split_outdated,
     with_content_hash,
     write_record,
@@ -26,6 +26,7 @@ from eitbench.worlds import entry
 
 from tiny import RUN, episode, record, sha, strict
 
+SCHEMA = (bundled_path("leaderboards") / "schema.json").read_text(encoding="utf-8")
 MINE = record("mine", [0.1, 0.25, None], parameters={"alpha": 0.1, "order": [1, 2], "β": 1e-22})
 
 
@@ -229,7 +230,7 @@ def test_only_the_highest_version_of_a_built_in_method_is_current():
 
 def test_the_schema_agrees_with_the_code():
     """The schema is valid, and has the subtracks of the code."""
-    schema = json.loads(schema_text())
+    schema = json.loads(SCHEMA)
     assert jsonschema_rs.meta.is_valid(schema)
     assert schema["$schema"].endswith("2020-12/schema")
     assert tuple(schema["properties"]["board"]["enum"]) == BOARDS
@@ -326,7 +327,7 @@ def places(value, path=()):
 
 def test_another_validator_agrees():
     """For any change of a record, jsonschema accepts and rejects the same, so that other tools can check the format."""
-    ours, theirs = (make(json.loads(schema_text())) for make in (
+    ours, theirs = (make(json.loads(SCHEMA)) for make in (
         jsonschema_rs.validator_for, jsonschema.Draft202012Validator))
     others = ["", "x" * 121, "a\x1bb", None, [], {}, 0, 0.5, 2**63, -1.0, 1e51, 5e-324, True, [None], {"a": {}}, ...]
     chance, valid = random.Random(1), 0
