@@ -14,6 +14,7 @@ from threadpoolctl import threadpool_limits
 from tqdm import tqdm
 
 from eitbench import _check, scoring
+from eitbench.bench.isolation import Worker
 from eitbench.bench.measured import MeasuredRun
 from eitbench.bench.methods import Method, load_method
 from eitbench.bench.scores import Outcome
@@ -79,6 +80,8 @@ def run_method(asked: Environment, method: Method, seed: int) -> EpisodeRun:
     method, or the method is incompatible with it or returns an invalid value."""
     check_track(asked.id, method.track)
     env = cached_environment(asked)
+    if isinstance(method.make, Worker):
+        method.make.ensure_started()                # before computing time is measured
     if isinstance(env, InjectionEnv):
         return _run_policy(env, method, seed)
     if is_measured(asked.id):

@@ -147,7 +147,7 @@ def read_case(name: Path | str) -> MeasuredCase:
     path = Path(name)
     if path.suffix != ".yml":
         names = {each.stem: each for each in sorted(CASES.glob("*.yml"))}
-        _check.choice("case without the suffix .yml", str(name), names)
+        _check.choice("case, if not a YAML file,", str(name), names)
         path = names[str(name)]
     entries = load_yaml(path, "case")
     if missing := [each for each in (*_TEXTS, "vessel") if each not in entries]:
