@@ -55,7 +55,7 @@ def list_() -> None:
             if schedule.budget is not None:
                 about += f", at most {schedule.budget} injections"
             if each.nominal:
-                about += f", shifted variant {each.variant} of {each.nominal}"
+                about += f", shifted environment, variant {each.variant} of {each.nominal}"
             if returns := published_returns(name):
                 about += ", returns " + ", ".join(f"{row['group']} {float(row['mean']):.3g}"
                                                   for row in returns)
@@ -202,7 +202,8 @@ def compare(
     score: Annotated[str, typer.Option(help="Score to compare.")] = "error",
 ) -> None:
     """Compare two methods seed by seed: differences with intervals, and the fraction of episodes in
-    which A is better. Several environments are compared by skill scores, as on the leaderboards."""
+    which A is better. The errors of several environments are aggregated as skill scores,
+    without shifted environments."""
     from eitbench.report import compare as comparison
     with options.cli_errors():
         ours, theirs = ([record for record in comparison.find_records(name, records)

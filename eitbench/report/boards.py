@@ -213,7 +213,7 @@ def leaderboard_table(found: Iterable[Leaderboard]) -> pd.DataFrame:
 
 
 def record_category(record: dict[str, Any]) -> str:
-    """Return the class in `CATEGORIES` of a record."""
+    """Return the category of a record, one of `CATEGORIES`."""
     return tracks.category_of(record["environment"]["id"], record["board"])
 
 

@@ -1,4 +1,4 @@
-"""Paired comparison of two methods: differences, intervals, fraction of episodes won."""
+"""Paired comparison of two methods: differences, probabilities of improvement, intervals."""
 
 from __future__ import annotations
 
@@ -45,16 +45,16 @@ MIN_VERSION_PREFIX = 4
 
 
 def find_records(name: str, folder: Path) -> list[dict[str, Any]]:
-    """Return the records of a method from the path of one, or from METHOD or METHOD@VERSION within
-    a folder, otherwise among the bundled records, otherwise in `OWN_RECORDS`. Without a version the
-    newest, official ones where there are any; a third-party version may be shortened to four
-    digits. The name of an agent without its training seed, such as ppo, is the mean over its
-    trainings.
+    """Return the record in the file NAME.json, or the records METHOD or METHOD@VERSION of the
+    first of these that has any: a folder, the package, `OWN_RECORDS`. Without a version the current
+    official records are returned, or else the other current ones. A third-party version may be
+    shortened to four digits. The name of an agent without training seed, such as ppo, selects its
+    `mean_over_trainings`.
 
     Raises
     ------
     ValueError
-        If no record matches, or a name without version fits several versions.
+        If no record matches, or records of several versions match.
     """
     if name.endswith(".json"):
         return [read_record(resolve_input(Path(name)))]
@@ -85,8 +85,8 @@ def find_records(name: str, folder: Path) -> list[dict[str, Any]]:
 
 
 def mean_over_trainings(records: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Return a record of each environment and split with the mean of each score over the trainings
-    of an agent, in the episodes that all of them finished."""
+    """Return a record for each environment and split, with the mean of each score over the training
+    seeds of an agent, in the episodes that all of them finished."""
     groups: dict[tuple[str, str], list[dict[str, Any]]] = {}
     for record in records:
         groups.setdefault(_environment_and_split(record), []).append(record)
@@ -104,14 +104,14 @@ def mean_over_trainings(records: list[dict[str, Any]]) -> list[dict[str, Any]]:
 
 
 def resolve_score(name: str) -> Score:
-    """Return the score of this name; ``ValueError`` if none has a better direction."""
+    """Return the score of this name; ``ValueError`` if it is unknown or has no better direction."""
     known = {each.name: each for each in scores().values() if each.direction in ("lower", "higher")}
     _check.choice("score", name, known)
     return known[name]
 
 
 def naive_baseline_records(folder: Path) -> list[dict[str, Any]]:
-    """Return the records of naive baselines: bundled ones, and from a folder, which precede."""
+    """Return the current records of naive baselines, of the package and then of a folder."""
     folders = dict.fromkeys([BUNDLED_RECORDS.resolve(), folder.resolve()])
     return split_outdated([record for each in folders for record in read_records(each)
                    if is_naive_baseline(record)])[0]
@@ -123,8 +123,8 @@ def compare(a: list[dict[str, Any]], b: list[dict[str, Any]], score: str = "erro
     and rows for several of them together.
 
     For the error, the aggregate rows compare skill scores: ``all filter`` and so on, for each
-    category with several environments, none of them a shifted variant, that have a baseline among
-    ``zero``. For other scores there is one row, ``all``.
+    category with several environments, shifted ones excluded, that have a naive baseline in the
+    records ``zero``. For other scores there is one row, ``all``.
 
     Returns
     -------
@@ -194,8 +194,8 @@ def display_names(a: dict[str, Any], b: dict[str, Any]) -> tuple[str, str]:
 
 
 def comparison_table(table: pd.DataFrame, a: str, b: str, score: str = "error") -> Table:
-    """Return the comparison of methods named ``a`` and ``b``, with the better one where the
-    95 % interval of the advantage of a excludes zero."""
+    """Return the comparison of methods named ``a`` and ``b``; column better has the name of the
+    better one where the 95 % interval of the advantage of a excludes zero."""
     asked = resolve_score(score)
     rows = []
     for row in table.to_dict("records"):

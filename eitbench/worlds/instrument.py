@@ -34,7 +34,7 @@ class Faults(NamedTuple):
 
 @dataclass(frozen=True)
 class Instrument:
-    """Current sources and voltmeters, intact by default. [T]: number of the thesis; others [ours].
+    """Current sources and voltmeters, intact by default. [T]: from the thesis; [E]: of eitbench.
 
     A broken wire leaves the electrode in place as an electrode without net current, so that the
     episode's transfer resistances stay exact. A current through a broken wire does not flow, and
@@ -43,7 +43,7 @@ class Instrument:
     """
 
     current: float = 0.1
-    """A (A/m in 2D); with relative noise the amplitude does not matter [ours]"""
+    """A (A/m in 2D); with relative noise the amplitude does not matter [E]"""
     noise_relative: float = 0.01
     """std relative to the measurement [T]"""
     noise_relative_to_max: float = 0.001

@@ -159,7 +159,7 @@ class Prior:
     """Prior of the estimators; standard deviations relative to ĉ_bh (thesis Table 5.1)."""
 
     expected_concentration: float = 25.0
-    """mol/m³; a rough concentration, deliberately not the background [ours]"""
+    """mol/m³; a rough concentration, deliberately not the background [E]"""
     inflow_std: float = 1 / 4
     """of the inflow noise η [T]"""
     nodal_std: float = 1 / 50
