@@ -213,8 +213,8 @@ for _score in (
           "true segmentation, 1 if equal",
           lambda outcome: outcome.ktc, direction="higher", tracks=("measured",)),
     Score("contrast_error", "contrast",
-          "error relative to the deviation of the truth from the homogeneous estimate; the "
-          "homogeneous estimate has 1",
+          "error relative to the deviation of the truth from the homogeneous estimate of the whole "
+          "episode, which has 1",
           _contrast_error, requires=("mean", "truth")),
     Score("nis", "NIS/m",
           "normalised innovation squared of all scored measurements; 1 if the filter's uncertainty "

@@ -239,9 +239,9 @@ electrodes are on the wall, and one pair of them injects all the time. A station
 injection shows nothing, but the flow carries the target through the field of the pair, and a filter
 with a flow model can track it (Seppänen 2005, 7.1, Figs 7.2 and 7.3).
 
-The truth is a rigid ball that does not follow the liquid; the model in `env.unwrapped.task` is a liquid
-without a ball, in which concentration is advected and diffuses, as in the thesis. The ball starts
-between 0.25 and 0.48 of the radius from the centre, at any angle; the flow is steady.
+The truth is a rigid ball that does not follow the liquid; the model in `env.unwrapped.task` is a
+liquid without a ball, in which concentration is advected and diffuses, as in the thesis. The ball
+starts between 0.25 and 0.48 of the radius from the centre, at any angle; the flow is steady.
 """)
 
 # -- Stationary tank (thesis 7.2) --
