@@ -85,7 +85,8 @@ def _compared_frames(env: Any, loaded: list[Method], seed: int, at: range) -> It
         truth, _, currents = shown[0][1][t]
         fields = [("Truth", truth_mesh(env.world), truth)]
         fields += [(title, env.task.mesh, states[t][1]) for title, states in shown]
-        yield rendering.draw_comparison(env.task, fields, currents, t * env.task.transport.time_step)
+        time = t * env.task.transport.time_step
+        yield rendering.draw_comparison(env.task, fields, currents, time)
 
 
 def _palette() -> Image.Image:
