@@ -24,8 +24,7 @@ def mean_and_interval(values: list[float]) -> tuple[float, float]:
 
 
 def format_mean(mean: float, half: float) -> str:
-    """Format as ``0.0053 ± 0.0004``: one digit of the interval (two if the first is 1, or if the
-    mean would have only one)."""
+    """Format as ``0.0053 ± 0.0004``: one digit of the interval, two if it or the mean needs two."""
     place = _places(half, mean)
     return f"{mean:.3g}" if place is None else f"{mean:z.{place}f} ± {half:.{place}f}"
 
@@ -39,8 +38,7 @@ def format_interval(value: float, low: float, high: float) -> str:
 
 
 def _places(half: float, value: float) -> int | None:
-    """Return the decimal places for a value and half its interval; None if the interval is infinite
-    or below the last place."""
+    """Return the decimal places of a value and half its interval; None if infinite or too small."""
     if not math.isfinite(half) or half < 5e-6:
         return None
     place = -math.floor(math.log10(half))

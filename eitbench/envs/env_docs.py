@@ -58,8 +58,8 @@ def _returns_table(id: str) -> list[str]:
     rows = published_returns(id)
     if not rows:
         return []
-    lines = [f"| {row['group']} | `{row['policy']}` | {row['mean']} ± {row['half_width']} |"
-             for row in rows]
+    lines = [f"| {row['group']} | `{row['policy']}` | {float(row['mean']):.3f} ± "
+             f"{float(row['half_width']):.3f} |" for row in rows]
     return ["## Returns", RETURNS_TEXT.strip(),
             "\n".join(["| group | best policy | return |", "|---|---|---:|", *lines])]
 

@@ -119,7 +119,7 @@ class ScoreAxes(NamedTuple):
         each = sorted(part.cells[name] for part in parts if part.is_ranked)
         if each:
             spread = format_interval(value, each[0], each[-1]).partition(" ")[2].strip("()")
-            interval += f" each {spread or format_number(value)}"
+            interval += f"; seeds {spread or format_number(value)}"
         drawn = charts.sparkline((value, low, high), self.axes[name], mark=self.marks[name],
                                  each=each)
         return Cell(text, value, drawn, note=interval.strip())

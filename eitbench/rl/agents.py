@@ -172,8 +172,7 @@ def load_agent(path: Path, content: bytes) -> tuple[str, str, type[AgentPolicy],
     try:
         model = ALGORITHMS[algo].load(io.BytesIO(content), device="cpu")
     except Exception as error:
-        raise ValueError(f"policy {path} must be a model of {ALGORITHMS[algo].__name__} in "
-                         f"stable-baselines3: {type(error).__name__}") from error
+        raise ValueError(f"policy {path} must be a model of the algorithm {algo}") from error
     policy = type("Policy", (_ModelPolicy,), {
         "model": model, "uses_action_masks": algo.startswith("maskable"),
         "estimator": asked.get("kwargs", {}).get("estimator", "reduced")})

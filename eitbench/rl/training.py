@@ -169,8 +169,7 @@ def train(env: str, algo: str, config: TrainingConfig, seed: int, folder: Path,
             json.loads(settings.read_text()), json.loads(json.dumps(asked))))
         if differ := [name for name in here if name != "config" and there[name] != here[name]]:
             found = ", ".join(f"{name} {there[name]}, not {here[name]}" for name in differ)
-            raise ValueError(f"out must be an empty folder or one of the same run; {folder} has "
-                             f"{found}")
+            raise ValueError(f"out must be empty, or of the same run; {folder} has {found}")
     if made.exists() and (folder / "sha256").exists() and not latest.exists():
         return made
     world: Any = gym.make(env, disable_env_checker=True, observation="raw",
