@@ -15,7 +15,7 @@ from eitbench import _check
 from eitbench.measured.readers import load_yaml
 from eitbench.numerics.mesh import Mesh
 from eitbench.physics.cem import CompleteElectrodeModel
-from eitbench.worlds.vessels import MeshVessel, PlanePipe, RoundPipe, RoundTank
+from eitbench.worlds.vessels import MAX_COVERAGE, MeshVessel, PlanePipe, RoundPipe, RoundTank
 
 NUMBERING_DIRECTIONS = ("counter-clockwise", "clockwise")
 INITIAL_CONTACT_IMPEDANCE = 1e-4
@@ -189,5 +189,7 @@ def _cover(entries: Mapping[str, Any], width: str, density: float) -> float:
         raise ValueError(f"vessel must have either {width} or cover, got "
                          f"{'both' if width in entries else 'neither'}")
     if "cover" in entries:
-        return _check.number("vessel.cover", entries["cover"])
-    return density * _check.number(f"vessel.{width}", entries[width], units="m")
+        return _check.number("vessel.cover", entries["cover"], low=0.0, high=MAX_COVERAGE,
+                             open_low=True)
+    return density * _check.number(f"vessel.{width}", entries[width], low=0.0, open_low=True,
+                                   high=MAX_COVERAGE / density, units="m")

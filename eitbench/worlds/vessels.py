@@ -18,6 +18,9 @@ if TYPE_CHECKING:
     from eitbench.numerics.mesh_files import MeshData
     from eitbench.physics.cem import CompleteElectrodeModel
 
+MAX_COVERAGE = 0.95
+"""Largest fraction of a wall that electrodes cover."""
+
 
 @dataclass(frozen=True)
 class Bulge:
@@ -384,7 +387,7 @@ class MeshVessel:
 def _check_electrodes(vessel: PlanePipe | RoundPipe | RoundTank) -> None:
     """Raise ``ValueError`` unless numbers of electrodes and liquid are in range."""
     check_positive(vessel, contact_impedance="Ω·m²", molar_conductivity="S·m²/mol")
-    _check.number("electrode_coverage", vessel.electrode_coverage, low=0.0, high=0.95,
+    _check.number("electrode_coverage", vessel.electrode_coverage, low=0.0, high=MAX_COVERAGE,
                   open_low=True)
 
 
