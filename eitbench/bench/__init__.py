@@ -38,7 +38,7 @@ def load(folder: Path | str | None = None, *, measured: bool = False) -> pd.Data
     Raises
     ------
     ValueError
-        If the folder does not exist, or naming the file, if one is not a valid record.
+        Naming the folder if it is missing, or a file that is not a valid record.
     """
     with require_extra("eitbench.leaderboard.load"):
         import pandas as pd

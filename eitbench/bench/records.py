@@ -36,7 +36,6 @@ from eitbench.bench.episode_table import read_episode_table, table_path
 from eitbench.data.seeds import format_seed, parse_seeds
 
 SCHEMA = 3
-BOARDS = tracks.ALL_SUBTRACKS
 COMMON_FIELDS = ("environment", "method", "board", "title", "parameters", "role", "privileged",
                  "version", "method_sha256", "checkpoint_sha256")
 """Fields that all episodes of a record share."""

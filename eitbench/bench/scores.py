@@ -119,9 +119,8 @@ class Score:
         _check.choice("direction", self.direction, SCORE_DIRECTIONS)
         for argument, values, allowed in (("requires", self.requires, Outcome.__dataclass_fields__),
                                           ("tracks", self.tracks, KINDS)):
-            if unknown := [each for each in values if each not in allowed]:
-                raise ValueError(f"{argument} must be among {', '.join(allowed)}; got "
-                                 f"{', '.join(map(repr, unknown))}")
+            for each in values:
+                _check.choice(f"each of {argument}", each, allowed)
         _check.number("factor", self.factor, low=0.0, open_low=True)
 
     def __call__(self, outcome: Outcome) -> float | None:

@@ -127,8 +127,7 @@ def nominal_id(id: str) -> str:
 def check_track(id: str, track: str) -> None:
     """Raise ``ValueError`` if an environment is unknown or of another track."""
     if track_of(id) != track:
-        raise ValueError(f"environment {id} is not of the track {track}; env must be one of "
-                         f"{', '.join(ids(track))}")
+        raise ValueError(f"environment {id} is not of the track {track}; see `eitbench list`")
 
 
 def registered_kwargs(id: str) -> dict[str, Any]:

@@ -11,7 +11,6 @@ import jsonschema_rs
 import pytest
 from eitbench._files import bundled_path
 from eitbench.bench.records import (
-    BOARDS,
     MAX_BYTES,
     MAX_RECORD_DEPTH,
     read_record,
@@ -21,7 +20,7 @@ from eitbench.bench.records import (
     with_content_hash,
     write_record,
 )
-from eitbench.bench.tracks import environment_name, subtracks_of
+from eitbench.bench.tracks import ALL_SUBTRACKS, environment_name, subtracks_of
 from eitbench.worlds import entry
 
 from tiny import RUN, episode, record, sha, strict
@@ -233,7 +232,7 @@ def test_the_schema_agrees_with_the_code():
     schema = json.loads(SCHEMA)
     assert jsonschema_rs.meta.is_valid(schema)
     assert schema["$schema"].endswith("2020-12/schema")
-    assert tuple(schema["properties"]["board"]["enum"]) == BOARDS
+    assert tuple(schema["properties"]["board"]["enum"]) == ALL_SUBTRACKS
     assert set(schema["required"]) == set(schema["properties"]) == set(MINE)
     fields = schema["$defs"]["episode"]["properties"]
     assert set(episode("test:0", 0.1)) | {"message", "where", "actions"} == set(fields)
@@ -263,7 +262,7 @@ def test_the_environment_determines_the_subtrack(id, kwargs, boards, tmp_path):
     """A record with another subtrack is rejected."""
     assert subtracks_of(id, kwargs) == tuple(boards.split())
     environment = {"id": id, "name": environment_name(id, kwargs), "kwargs": kwargs}
-    for board in BOARDS:
+    for board in ALL_SUBTRACKS:
         made = record("mine", [0.1], board=board, environment=environment)
         if board in boards.split():
             assert read_record(write_record(tmp_path, made)) == made

@@ -114,8 +114,8 @@ def test_only_scores_with_a_direction_are_compared(name, records):
     ({"name": "error"}, "has the name or heading of another, error"),
     ({"heading": "CRPS"}, "has the name or heading of another, crps"),
     ({"better": "more"}, "direction must be one of lower, higher"),
-    ({"requires": ("luck",)}, "requires must be among world, .*got 'luck'"),
-    ({"tracks": ("sprint",)}, "tracks must be among estimation, injection, measured; got 'sprint'"),
+    ({"requires": ("luck",)}, "each of requires must be one of .*got 'luck'"),
+    ({"tracks": ("sprint",)}, "each of tracks must be one of estimation, injection, measured; got 'sprint'"),
     ({"factor": 0.0}, "factor must be")])
 def test_invalid_scores_are_rejected(changes, message, apart):
     """Nothing is registered."""
