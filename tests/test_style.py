@@ -9,14 +9,14 @@ import pytest
 
 ROOT = Path(__file__).parent.parent
 PACKAGE = ROOT / "eitbench"
-BUDGETS = {"numerics": 1590, "scoring": 110, "physics": 1420, "worlds": 2755, "data": 1620, "estimation": 5680,
-           "measured": 1918, "envs": 1750, "bench": 5010, "report": 3110, "rl": 835, "cli": 1025}
+BUDGETS = {"numerics": 1590, "scoring": 110, "physics": 1460, "worlds": 2755, "data": 1620, "estimation": 5680,
+           "measured": 1918, "envs": 1750, "bench": 5056, "report": 3110, "rl": 835, "cli": 1025}
 """Package (or module) -> lines of Python allowed, blank lines and docstrings included. Each imports only from those
 before it."""
 TOP = 443
 """Lines allowed in the other modules at the top: public names, argument checks, files, messages."""
 BASELINES = 1850
-TESTS = 19_960
+TESTS = 20_020
 MODULES = {".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__"): path
            for path in PACKAGE.rglob("*.py")}
 

@@ -20,13 +20,15 @@ from eitbench.bench.methods import Method, load_method
 from eitbench.bench.scores import Outcome
 from eitbench.bench.tracks import Environment, check_track, is_measured, subtrack_of
 from eitbench.data.episode_cache import region_operators, truth_mesh
-from eitbench.data.episodes import simulate
+from eitbench.data.episodes import cached_truth_model, simulate
 from eitbench.data.seeds import allow_test_seeds
 from eitbench.envs.estimation import EstimationEnv
 from eitbench.envs.injection import InjectionEnv
 from eitbench.estimation import best_homogeneous
 from eitbench.estimation.walk import RandomWalk
+from eitbench.physics.cross_section import outlet_of
 from eitbench.physics.stationary import StationaryTransport
+from eitbench.physics.transport import ConvectionDiffusion
 from eitbench.worlds.random_streams import episode_streams, generator_from_state
 from eitbench.worlds.registry import entry
 from eitbench.worlds.task import Estimate, Task
@@ -201,7 +203,30 @@ class EstimatorOutput:
             mean=mean, truth=truth, mass=mass,
             points=truth_mesh(env.world).points, homogeneous=homogeneous,
             voltages_measured=self.voltages[states], voltages_predicted=computed,
-            innovations=innovations, std=std, velocity=velocity)
+            innovations=innovations, std=std, velocity=velocity,
+            solute_flow=_solute_flow(env, self.means[states], self.velocities[states]))
+
+
+def _solute_flow(env: EstimationEnv, means: np.ndarray, velocities: np.ndarray,
+                 ) -> tuple[np.ndarray, np.ndarray] | None:
+    """Return the estimated and the true flow of solute through the outlet (S,) in mol/s, for means
+    (S, n) and flow parameters (S, k) of the scored states; None without a flow through the vessel.
+    """
+    task, world = env.task, env.world
+    model, truth = task.transport, cached_truth_model(world).transport
+    if not (isinstance(model, ConvectionDiffusion) and isinstance(truth, ConvectionDiffusion)
+            and model.inlet.size):
+        return None
+    drawn = world.flow.draw(world, episode_streams(env.core.seeds[0]).flow)
+    outlet = outlet_of(model)
+    estimated = [outlet.solute_flow(mean, task.velocity.field(parameters) if task.velocity
+                                    else model.velocity)
+                 for mean, parameters in zip(means, velocities, strict=True)]
+    outlet = outlet_of(truth)
+    first = task.warm_up + 1
+    true = [outlet.solute_flow(concentration, drawn(t) if drawn else truth.velocity)
+            for t, concentration in enumerate(env.truth()[task.warm_up:], first)]
+    return np.array(estimated), np.array(true)
 
 
 def _run_policy(env: InjectionEnv, policy: Method, seed: int) -> EpisodeRun:

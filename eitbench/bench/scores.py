@@ -60,6 +60,8 @@ class Outcome:
     """(S, m) mol/m³, if every scored state has a variance"""
     velocity: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None
     """(S, p) estimated and true m/s, and weights (p,), where the task includes the flow"""
+    solute_flow: tuple[np.ndarray, np.ndarray] | None = None
+    """(S,) estimated and true flow of solute through a pipe's outlet, mol/s (mol/(s·m) in 2D)"""
     mean_nis: float | None = None
     """NIS/m of measurements"""
     ktc: float | None = None
@@ -183,6 +185,16 @@ def _velocity_error(outcome: Any) -> float:
     return scoring.relative_error(estimated, true, np.diag(weights))
 
 
+def _solute_flow_error(outcome: Any) -> float:
+    estimated, true = outcome.solute_flow
+    return float(np.sqrt(((estimated - true)**2).sum() / (true**2).sum()))
+
+
+def _solute_amount_error(outcome: Any) -> float:
+    estimated, true = outcome.solute_flow
+    return float(abs(estimated.sum() / true.sum() - 1.0))
+
+
 def _nis(outcome: Any) -> float | None:
     """Mean of νᵀS⁻¹ν/m over injections, with the m accepted measurements of each."""
     if outcome.innovations is None:
@@ -225,6 +237,12 @@ for _score in (
           "relative error of the flow, ∫(v̂ − v)²/∫v² across the pipe, where the task includes the "
           "flow",
           _velocity_error, requires=("velocity",)),
+    Score("solute_flow_error", "flow error",
+          "relative RMS error of the solute flow through the outlet, ∫ĉ v̂·n against ∫c v·n",
+          _solute_flow_error, requires=("solute_flow",)),
+    Score("solute_amount_error", "amount error",
+          "relative error of the amount of solute that leaves the pipe during the scored states",
+          _solute_amount_error, requires=("solute_flow",)),
     Score("coverage_50", "50 %", "fraction of the truth inside the reported 50 % interval",
           lambda outcome: scoring.coverage(*_uncertainty(outcome), 0.5),
           direction="nominal", requires=("std",), tracks=TRACKS),
