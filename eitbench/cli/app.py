@@ -39,7 +39,7 @@ def _main(
 @app.command("list")
 def list_() -> None:
     """List environments, built-in estimators and policies, with their subtracks."""
-    from eitbench.bench.methods import builtin_methods, load_method
+    from eitbench.bench.methods import builtin_methods, builtin_summary
     from eitbench.bench.tracks import ids, measured_ids, subtracks_of
     from eitbench.worlds.registry import GROUPS, entry, published_returns
     from eitbench.worlds.task import lag_steps
@@ -66,8 +66,8 @@ def list_() -> None:
               for name in measured_ids()]
     for track, heading in (("estimation", "estimators"), ("injection", "policies")):
         lines.append((heading, "", ""))
-        lines += [(f"  {name}", ", ".join((method := load_method(name, track)).subtracks),
-                   method.title) for name in builtin_methods(track)]
+        lines += [(f"  {name}", ", ".join(subtracks), title) for name in builtin_methods(track)
+                  for title, subtracks in [builtin_summary(name, track)]]
     for name, boards, about in lines:
         options.echo(f"{name:42} {boards:30}  {about}".rstrip())
 
