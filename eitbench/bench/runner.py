@@ -38,11 +38,11 @@ if TYPE_CHECKING:
     from eitbench.envs.measured import MeasuredEnv
 
 Step = tuple[int, Estimate | None, dict[str, np.ndarray], float]
-"""t of an estimate, the estimate, the last measurement, and the estimator's time in s."""
+"""t of the estimate, the estimate, the last voltages and currents, and the computing time in s."""
 
 
 class EpisodeRun(NamedTuple):
-    """A finished episode."""
+    """Results of a method in one episode."""
 
     outcome: Outcome
     currents: np.ndarray
@@ -72,7 +72,7 @@ def _cached_environment(asked: Environment, world: World | None, settings: str) 
 
 
 def is_compatible(method: Method, env: Any) -> bool:
-    """Return whether an environment is of one of a method's subtracks and compatible with it."""
+    """Return whether a method supports the subtrack and the task or rules of an environment."""
     known = env.rules if isinstance(env, InjectionEnv) else env.task
     return subtrack_of(env) in method.subtracks and method.suits(known)
 
@@ -98,7 +98,7 @@ def run_on_measurements(env: MeasuredEnv, method: str | Method, seed: int = 0, *
     """Run an estimator, built-in or given by a path, on measurements.
 
     ``seed`` determines the withheld measurements; estimates are stored for the steps ``kept``, by
-    default all. ``ValueError`` if the method is incompatible or returns an invalid estimate.
+    default all. ``ValueError`` if the method is incompatible or an estimate is invalid.
     """
     if isinstance(method, str):
         method = load_method(method, "estimation")
@@ -139,9 +139,9 @@ class EstimatorOutput:
         self.velocities = np.tile(task.velocity.nominal if task.velocity else (), (task.n_steps, 1))
         """(T, k) parameters of the flow in m/s; k = 0 if the task specifies the flow"""
         self.innovations: dict[int, tuple[np.ndarray, np.ndarray]] = {}
-        """measurement i -> (ν, S)"""
+        """i of a measurement vector -> ν (L,) in V and S (L, L) in V²"""
         self.seconds: list[float] = []
-        """time of each update; the first includes the constructor"""
+        """computing time of each update in s; the first includes the constructor"""
         measured = []
         for t, estimate, measurement, elapsed in steps:
             measured.append(measurement)
@@ -162,7 +162,7 @@ class EstimatorOutput:
         self.voltages, self.currents = (
             np.array([each[key] for each in measured[:task.n_steps]])
             for key in ("voltages", "currents"))
-        """(T, L) V, and A"""
+        """(T, L) V, and (T, L) A (A/m in 2D)"""
         self.has_std = bool(np.isfinite(self.variances[task.warm_up:]).all())
         """True if every scored state has a variance"""
 
@@ -261,7 +261,7 @@ def _run_policy(env: InjectionEnv, policy: Method, seed: int) -> EpisodeRun:
 
 def iter_injections(env: InjectionEnv, policy: Method, seed: int,
                     ) -> Iterator[tuple[int, dict[str, np.ndarray], float, Any, float]]:
-    """Yield (t of the observed state, observation, seconds of the policy, its action, JSON-ready,
+    """Yield (t, observation of state t, computing time of the policy in s, its action, JSON-ready,
     and the reward) after each injection of one episode. The first time includes the policy's
     constructor. Errors as in `run_method`."""
     if not policy.suits(env.rules):
@@ -300,7 +300,7 @@ def iter_estimates(env: EstimationEnv, estimator: Method,
 
 def _iter_steps(env: EstimationEnv | MeasuredEnv, estimator: Method, seed: int,
                 ) -> Iterator[Step]:
-    """Yield (t = i − lag, estimate, measurement i, seconds of the estimator) at each step i."""
+    """Yield (t = i − lag, estimate, measurement i, computing time in s) at each step i."""
     with allow_test_seeds():
         observation, _ = env.reset(seed=seed)
     if estimator.privileged and not isinstance(env, EstimationEnv):

@@ -29,7 +29,7 @@ CATEGORIES = ("filter", "fixed-lag", "smoothing", "stationary", "injection")
 NAIVE_BASELINES = {"estimation": "homogeneous", "injection": "random_pair"}
 """Naive baselines: they define a leaderboard's episodes and the zero of its skill score."""
 ONBOARD_FILTERS = ("full", "reduced")
-"""Filters inside an injection environment: the exact one for scores, the reduced for training."""
+"""Filters inside an injection environment: the full one for scores, the reduced for training."""
 
 MEASURED = "eitbench.envs.measured:case_env"
 """Entry point of the ids of measured cases."""
@@ -41,7 +41,7 @@ QUICK_IDS = ("eitbench/Pipe2D-v0", "eitbench/Pipe2DFixedLag-v0", "eitbench/Pipe2
 """Environments of the quick suite; the full suite has all of the track estimation."""
 QUICK_SEEDS = "test:0-3"
 RUN_KWARGS = {"estimation": {}, "injection": {"estimator": "full", "observation": "raw"}}
-"""Default arguments of each track's environments in runs: the exact filter and unscaled
+"""Default arguments of each track's environments in runs: the full filter and unscaled
 observations. Registered ids have other defaults, for training."""
 
 

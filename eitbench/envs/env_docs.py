@@ -33,8 +33,8 @@ KEY_DESCRIPTIONS = {
 """Meaning of each entry of an observation."""
 
 RETURNS_TEXT = """
-Mean sum of rewards in the episodes dev:0–31 with the reduced filter, ± half its 95 % interval, of
-the best built-in policy of each group. `spec.reward_threshold` is the largest return without
+Mean sum of rewards in the episodes dev:0–31 with the reduced filter, ± half of its 95 % interval,
+of the best built-in policy of each group. `spec.reward_threshold` is the largest return without
 training. Made by `python studies/returns.py`.
 """
 
