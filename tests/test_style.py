@@ -9,7 +9,7 @@ import pytest
 
 ROOT = Path(__file__).parent.parent
 PACKAGE = ROOT / "eitbench"
-BUDGETS = {"numerics": 1590, "scoring": 110, "physics": 1460, "worlds": 2755, "data": 1620, "estimation": 5680,
+BUDGETS = {"numerics": 1590, "scoring": 110, "physics": 1460, "worlds": 2756, "data": 1620, "estimation": 5680,
            "measured": 1918, "envs": 1750, "bench": 5065, "report": 3110, "rl": 835, "cli": 1025}
 """Package (or module) -> lines of Python allowed, blank lines and docstrings included. Each imports only from those
 before it."""

@@ -125,6 +125,8 @@ def train(
         if steps is not None:
             asked = replace(asked, total_steps=steps)
         folder = out or Path("results/training") / env.replace("/", "-") / algo / f"seed{seed}"
+        options.echo(f"{asked.total_steps} steps of {algo.value}, configured by {config}, with "
+                     f"evaluations every {asked.interval} steps, in {folder}")
         splits = {"dev": asked.evaluation_episodes, "train": asked.episodes}
         missing = {f"{split}:0-{n - 1}": len(missing_seeds(entry(env).world, SPLITS[split][:n]))
                    for split, n in splits.items()}

@@ -61,6 +61,8 @@ def verify(
         _check_arguments(paths or [], every, top, episodes, held_out, secret, method)
         key = read_secret(secret) if secret else b""
         chosen = paths or select_records(records, env or [], top=top)
+        if missing := [str(path) for path in chosen if not path.is_file()]:
+            raise ValueError(f"records must be files, got {', '.join(missing)}")
     if every and out is None:
         out = Path("results/verify")
     drawn = 0 if every and seed is None else secrets.randbelow(2**32) if seed is None else seed

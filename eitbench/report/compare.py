@@ -81,7 +81,8 @@ def find_records(name: str, folder: Path) -> list[dict[str, Any]]:
             raise ValueError(f"{name} fits several versions: {found}")
         if own:
             return own
-    raise ValueError(f"record of {name} not found in {folder}" + _check.did_you_mean(method, known))
+    raise ValueError(f"record of {name} not found in {folder}, the package, or {OWN_RECORDS}"
+                     + ("" if method in known else _check.did_you_mean(method, known)))
 
 
 def mean_over_trainings(records: list[dict[str, Any]]) -> list[dict[str, Any]]:
@@ -155,16 +156,18 @@ def compare(a: list[dict[str, Any]], b: list[dict[str, Any]], score: str = "erro
             own, other = ({seed: each[seed] for seed in shared} for each in pair)
             both[label] = own, other
             level = levels.get(place, {})
-            is_shifted = bool(nominal_id(record["environment"]["id"]))
-            if not is_shifted and (gained := skill_scores(level, own)):
+            if (gained := skill_scores(level, own)) and not nominal_id(record["environment"]["id"]):
                 gains[record_category(record)][label] = gained, skill_scores(level, other)
     if not both:
-        also = f" with {score}" if score != "error" else ""
-        raise ValueError(f"methods must share an environment and a seed that both finished{also}")
+        finished = (f"{len(scores_by_seed(record, score))} episodes of {record['method']} in "
+                    f"{qualified_name(record['environment'])}" for record in (*a, *b))
+        raise ValueError(f"methods must share an environment and a seed that both finished with "
+                         f"{score}; there are {', '.join(finished)}")
     rows = [_row(label, score, {label: pair}, mean_over_environments, higher=higher)
             for label, pair in both.items()]
     if score == "error":
-        rows += [_row(f"all {kind}", SKILL_SCORE, together, interquartile_mean, higher=True)
+        rows += [_row(f"all {kind} ({len(together)} environments)", SKILL_SCORE, together,
+                      interquartile_mean, higher=True)
                  for kind, together in gains.items() if len(together) > 1]
     elif len(both) > 1:
         rows.append(_row("all", score, both, mean_over_environments, higher=higher))
@@ -221,8 +224,7 @@ def comparison_table(table: pd.DataFrame, a: str, b: str, score: str = "error") 
 def format_comparison(table: pd.DataFrame, a: str, b: str, score: str, width: int) -> str:
     """Return the comparison in lines of ``width`` characters, where the methods are A and B."""
     whole = comparison_table(table, "A", "B", score)
-    first = ("environment", "better", "advantage of A", *whole.headings[3:5], "A better",
-             "episodes")
+    first = ("environment", "better", "advantage of A", "A better", *whole.headings[3:5])
     fitted = whole.fit_width(width, first)
     return "\n\n".join([f"A: {a}\nB: {b}", fitted.markdown(),
                         *filter(None, [whole.omitted_columns(fitted)])])

@@ -122,6 +122,8 @@ def make_task(world: World, lag: int | str = 0, **assumed: Any) -> Task:
     assumed
         Other assumptions on the flow than the default; see `World.estimator_model`.
     """
+    if not isinstance(world, World):
+        raise TypeError(f"world must be a World, as of gymnasium.make(id).unwrapped, got {world!r}")
     steps = lag_steps(world, lag)
     model = _model(world.truth_config, tuple(sorted(assumed.items())))
     currents = world.currents
