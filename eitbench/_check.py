@@ -14,6 +14,8 @@ NUMERIC_KINDS = "biufO"
 """Kinds of arrays that can hold real numbers, without complex numbers, dates and text."""
 MAX_DEPTH = 20
 """Default limit of the depth of nested lists and dicts."""
+MAX_LISTED = 10
+"""Largest number of accepted names that a message lists."""
 
 
 def number(name: str, value: object, *, low: float = -math.inf, high: float = math.inf,
@@ -83,6 +85,19 @@ def array(name: str, value: object, shape: Iterable[int | None], *, units: str =
         raise ValueError(f"{name} must be positive{_in(units)}, got {result.min():g} at index "
                          f"{_first(result <= 0)}")
     return result
+
+
+def choice(name: str, value: object, known: Iterable[str]) -> None:
+    """Raise ``ValueError``, which lists ``known`` or the most similar of many, unless ``value`` is
+    among them."""
+    names = list(known)
+    if value in names:
+        return
+    listed = ", ".join(names)
+    if len(names) > MAX_LISTED:
+        similar = difflib.get_close_matches(str(value), names, n=MAX_LISTED // 2, cutoff=0.0)
+        listed = f"{', '.join(similar)}, … ({len(names)} in all)"
+    raise ValueError(f"{name} must be one of {listed}; got {value!r}{did_you_mean(value, names)}")
 
 
 def did_you_mean(given: object, known: Iterable[str]) -> str:

@@ -38,14 +38,17 @@ def load(folder: Path | str | None = None, *, measured: bool = False) -> pd.Data
     Raises
     ------
     ValueError
-        Naming the file, if one is not a valid record.
+        Naming the folder if it is missing, or a file that is not a valid record.
     """
     with require_extra("eitbench.leaderboard.load"):
         import pandas as pd
 
         from eitbench._files import bundled_path
+        from eitbench.bench.episode_table import table_path
         from eitbench.bench.records import read_records, read_valid_files, split_outdated
     path = Path(folder or bundled_path("leaderboards") / "results")
+    if not path.is_dir() and not table_path(path).is_file():
+        raise ValueError(f"folder must hold records, got {path}, which does not exist")
     records = read_records(path)
     if measured:
         records += read_valid_files(path, measured=True)[0].values()

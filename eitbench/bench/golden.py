@@ -19,6 +19,7 @@ import gymnasium as gym
 import numpy as np
 from threadpoolctl import threadpool_limits
 
+from eitbench import _check
 from eitbench._files import PACKAGE, write_atomically
 from eitbench.bench import methods, runner, tracks
 from eitbench.bench.methods import is_path, load_method
@@ -112,9 +113,8 @@ def update(names: list[str], *, new_version: bool = False) -> Iterator[tuple[str
     ``ValueError`` if a name is neither a built-in id nor a built-in method.
     """
     ids, known = tracks.builtin_ids(), golden_methods()
-    if unknown := [name for name in names if name not in ids and name not in known]:
-        raise ValueError(f"names must be ids, or methods of {', '.join(known)}; got "
-                         f"{', '.join(unknown)}")
+    for name in names:
+        _check.choice("each of names", name, [*ids, *known])
     for name in names or [*ids, *known]:
         if name in known:
             yield (name, *_update_method(name, known[name], new_version))

@@ -11,6 +11,7 @@ import hashlib
 import json
 import math
 import os
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,11 +19,14 @@ import numpy as np
 from scipy.stats import permutation_test
 
 from eitbench._files import bundled_path
-from eitbench.bench.isolation import check_out_of_reach
+from eitbench.bench.isolation import WorkerError, check_out_of_reach, close
 from eitbench.bench.methods import is_builtin
+from eitbench.bench.records import read_record
 from eitbench.bench.run import Job, run_episode
 from eitbench.bench.text import scores_by_seed
 from eitbench.bench.tracks import NAIVE_BASELINES
+from eitbench.bench.verify import job_for_record, submitted_methods_folder
+from eitbench.data.cache import use_cache_dir
 from eitbench.data.seeds import SPLITS, parse_seeds
 
 COMMITMENT = bundled_path("leaderboards") / "held_out.json"
@@ -58,6 +62,26 @@ def held_out_seeds(secret: bytes, count: int) -> list[int]:
     digests = (hashlib.sha256(secret + k.to_bytes(8, "big")).digest() for k in range(count))
     drawn = (int.from_bytes(digest, "big") % 2**63 for digest in digests)
     return [seed if seed >= FIRST_SEED else seed + FIRST_SEED for seed in drawn]
+
+
+def verify_all_held_out(paths: Sequence[Path], folder: Path, file: str | None, isolate: str,
+                        secret: bytes, episodes: int) -> tuple[list[dict[str, str]], list[str]]:
+    """Verify records one after the other by `verify_held_out`, with ``file`` and ``isolate`` of
+    `job_for_record` and a cache in ``folder``; return the rows, and the problems by record."""
+    rows: list[dict[str, str]] = []
+    problems: list[str] = []
+    with use_cache_dir(folder / "held-out"):
+        for path in paths:
+            try:
+                record = read_record(path)
+                job = job_for_record(record, file, isolate, submitted_methods_folder(path))
+                row, found = verify_held_out(record, job, secret, episodes)
+            except (ValueError, WorkerError) as error:
+                row, found = {}, [str(error)]
+            rows += [{"error relative to the naive baseline": path.stem} | row] if row else []
+            problems += [f"{path.name}: {sentence}" for sentence in found]
+        close()
+    return rows, problems
 
 
 def verify_held_out(record: dict[str, Any], job: Job, secret: bytes,

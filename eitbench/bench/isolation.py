@@ -56,6 +56,7 @@ MAX_HEADER_BYTES = 1 << 20
 MAX_ARRAY_BYTES = 1 << 28
 MAX_OUTPUT_CHARS = 10_000
 """limit of the printed text that is shown for one episode"""
+MAX_TEXT_CHARS = 2000
 METHOD_NAME = re.compile(r"[^./\\][^/\\]{0,99}")
 NUMERIC_ENV = ("OPENBLAS_", "MKL_", "OMP_", "NPY_", "NUMBA_CPU")
 """Prefixes of environment variables that change the last bits of results."""
@@ -95,8 +96,7 @@ def choose_isolation(environment: Environment, method: str, isolate: str = "auto
     measurements from the file. ``ValueError`` if the value is invalid, bubblewrap is required and
     does not work, or with ``strict`` a third-party file would run in this process.
     """
-    if isolate not in ISOLATE:
-        raise ValueError(f"isolate must be one of {', '.join(ISOLATE)}, got {isolate!r}")
+    _check.choice("isolate", isolate, ISOLATE)
     third_party = not is_builtin(method)
     if is_measured(environment.id):
         if strict and third_party and isolate != "none":
@@ -274,7 +274,8 @@ def _load(track: str, id: str, kwargs: str, method: str, isolation: str, path: P
     try:
         worker.start()
     except WorkerError as error:
-        raise ValueError(f"{path} cannot be loaded: {error}") from None
+        raise ValueError(f"{path} cannot be loaded: {str(error).removeprefix('ValueError: ')}"
+                         ) from None
     about = worker.about
     if path.suffix == ".py":
         about["name"] = path.stem  # a worker may report any name
@@ -357,11 +358,15 @@ class Worker:
             self.close()
             raise
 
+    def ensure_started(self) -> None:
+        """Start the process unless it runs."""
+        if not self.is_alive:
+            self.start()
+
     def __call__(self, task: Any, random: np.random.Generator | None = None) -> Worker:
         """Begin an episode with a new instance of the method, like its class; a policy draws from a
         generator with the state of ``random``."""
-        if not self.is_alive:
-            self.start()
+        self.ensure_started()
         self._left_s, self._left_chars = EPISODE_TIMEOUT_S, MAX_OUTPUT_CHARS
         self._ask("begin", random=None if random is None else random.bit_generator.state)
         return self
@@ -375,7 +380,7 @@ class Worker:
             return None
         if kind != "Estimate" or not {"mean"} <= set(arrays) <= set(Estimate._fields):
             raise WorkerError("ValueError: Estimator.update must return an Estimate or None, got "
-                              f"{_text(kind)}")
+                              f"{str(kind)[:MAX_TEXT_CHARS]}")
         return Estimate(**arrays)
 
     def act(self, observation: Arrays) -> Any:
@@ -453,11 +458,12 @@ class Worker:
         except BaseException:  # a later reply would belong to this request
             self._kill()
             raise
-        self._show(_text(reply.pop("printed", ""), MAX_OUTPUT_CHARS))
+        self._show(str(reply.pop("printed", ""))[:MAX_OUTPUT_CHARS])
         if "error" in reply:
-            failed = WorkerError(_text(reply["error"]))
-            failed.where = _text(reply.get("where"))
-            failed.traceback = _text(reply.get("traceback"))
+            message, where, traceback = (str(reply.get(name))[:MAX_TEXT_CHARS]
+                                         for name in ("error", "where", "traceback"))
+            failed = WorkerError(message)
+            failed.where, failed.traceback = where, traceback
             raise failed
         return reply, arrays
 
@@ -535,10 +541,6 @@ def _status(pid: int, field: str, file: str = "status") -> int:
         return 0
     found = re.search(rf"^{field}:\s+(\d+)( kB)?", text, re.MULTILINE)
     return int(found[1]) * (1024 if found[2] else 1) if found else 0
-
-
-def _text(value: Any, length: int = 2000) -> str:
-    return str(value)[:length]
 
 
 # -- the worker process -------------------------------------------------------------------------
@@ -651,7 +653,7 @@ class _MethodServer:
         message = f"{type(error).__name__}: {error}".replace(f"{self._file.parent}/", "")
         found = {"error": message, "where": error_location(error, self._file),
                  "traceback": user_traceback(error, self._file)}
-        return {key: _sendable(value, 2000) for key, value in found.items()}
+        return {key: _sendable(value, MAX_TEXT_CHARS) for key, value in found.items()}
 
 
 def _sendable(text: str, length: int = MAX_OUTPUT_CHARS) -> str:

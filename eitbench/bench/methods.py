@@ -220,7 +220,7 @@ def method_files(path: Path) -> dict[str, bytes]:
         file = path.with_name(name) if name == Path(name).name else Path()
         if not file.is_file():
             raise ValueError(f"{path}: files must name files in the folder of the method, got "
-                             f"{name!r}")
+                             f"{name!r}, which does not exist there")
         if file.stat().st_size > MAX_METHOD_BYTES:
             raise ValueError(f"{file} must have {MAX_METHOD_BYTES >> 20} MiB at most")
         contents[name] = file.read_bytes()
@@ -228,24 +228,38 @@ def method_files(path: Path) -> dict[str, bytes]:
 
 
 def _named_files(path: Path, source: bytes) -> tuple[str, ...]:
-    """Return the literal ``files`` of the class `Estimator` or `Policy`; empty without one."""
+    """Return the ``files`` of the class `Estimator` or `Policy`; empty without any."""
     try:
-        tree = ast.parse(source)
-    except (SyntaxError, ValueError):
-        return ()                   # loading reports the error
-    types = {kind.type for kind in METHOD_KINDS.values()}
-    for statement in (each for node in tree.body if isinstance(node, ast.ClassDef)
-                      and node.name in types for each in node.body):
-        if isinstance(statement, ast.Assign) and ast.unparse(statement.targets[0]) == "files":
-            try:
-                names = ast.literal_eval(statement.value)
-            except ValueError:
-                names = None
-            if not isinstance(names, tuple) or not all(isinstance(each, str) for each in names):
-                raise ValueError(f"{path}: files must be a tuple of names of files, got "
-                                 f"{ast.unparse(statement.value)}")
+        names = _class_attribute(source, "files", ())
+        if isinstance(names, tuple) and all(isinstance(each, str) for each in names):
             return names
-    return ()
+    except SyntaxError:
+        return ()                   # loading reports the error
+    except ValueError:
+        pass
+    raise ValueError(f"{path}: files must be a literal tuple of names of files")
+
+
+def _class_attribute(source: bytes, name: str, default: Any) -> Any:
+    """Return the literal value of an attribute of the class `Estimator` or `Policy`."""
+    types = {kind.type for kind in METHOD_KINDS.values()}
+    body = (each for node in ast.parse(source).body if isinstance(node, ast.ClassDef)
+            and node.name in types for each in node.body if isinstance(each, ast.Assign))
+    return next((ast.literal_eval(each.value) for each in body
+                 if ast.unparse(each.targets[0]) == name), default)
+
+
+def builtin_summary(name: str, track: str) -> tuple[str, tuple[str, ...]]:
+    """Return title and subtracks of a built-in method from its source, without executing it."""
+    source = find_method(name, track).read_bytes()
+    return (title_of(ast.get_docstring(ast.parse(source)), name),
+            _class_attribute(source, "subtracks", SUBTRACKS[track][:1]))
+
+
+def title_of(docstring: str | None, name: str) -> str:
+    """Return the title in a method's docstring, see `Method`; its name without one."""
+    paragraph = " ".join((docstring or "").strip().split("\n\n")[0].split())
+    return re.split(r"[.:](?:\s|$)", paragraph)[0][:MAX_TITLE_CHARS].strip() or name
 
 
 def method_sha256(contents: Mapping[str, bytes]) -> str:
@@ -269,13 +283,11 @@ def find_method(name: str, track: str) -> Path:
         path = resolve_input(Path(name))
     else:
         known = installed_methods() | {each: folder / f"{each}.py" for each in own}
-        path = known.get(name, Path())
+        _check.choice(f"{form.kind}, if not the path of {form.files},", name, known)
+        path = known[name]
     if not path.is_file():
-        names = [*own, *installed_methods()]
-        hint = (f": {AGENTS_NOT_BUNDLED}" if "checkpoints" in path.parts
-                else _check.did_you_mean(name, names))
-        raise ValueError(f"{form.kind} must be the path of {form.files}, or one of "
-                         f"{', '.join(names)}; got {name!r}{hint}")
+        hint = f": {AGENTS_NOT_BUNDLED}" if "checkpoints" in path.parts else ""
+        raise ValueError(f"{form.kind} {path} does not exist, or is not a file{hint}")
     if path.stat().st_size > MAX_METHOD_BYTES:
         raise ValueError(f"{form.kind} {path} must have {MAX_METHOD_BYTES >> 20} MiB at most")
     if path.stem in own and not path.samefile(folder / f"{path.stem}.py"):
@@ -306,10 +318,8 @@ def _load(path: Path, source: bytes, sha256: str, track: str) -> Method:
     if not isinstance(method, type):
         raise ValueError(f"{form.kind} {path} must define a class {form.type} with a method "
                          f"{form.interface}")
-    paragraph = " ".join((module.__doc__ or "").strip().split("\n\n")[0].split())
-    title = re.split(r"[.:](?:\s|$)", paragraph)[0][:MAX_TITLE_CHARS].strip() or path.stem
     return method_from_class(method, track, path.stem, str(path))._replace(
-        title=title, path=path, sha256=sha256)
+        title=title_of(module.__doc__, path.stem), path=path, sha256=sha256)
 
 
 def method_from_class(method: type[Any], track: str, name: str, where: str = "") -> Method:

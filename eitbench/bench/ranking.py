@@ -1,5 +1,5 @@
-"""Shared ranks, from the number of methods that are significantly better than a method, and means
-over the trainings of an agent."""
+"""Ranks of methods, from the number of significantly better ones, and mean scores over the training
+seeds of an agent."""
 
 from __future__ import annotations
 
@@ -26,24 +26,24 @@ def shared_ranks(scores: Mapping[str, Scores], *,
     better.
 
     A method is significantly better if the interval of the `paired_difference` excludes zero on the
-    better side. Rank 1 means that no method is significantly better, rank 3 that two are. A method
-    with too few episodes for an interval does not affect the ranks of others.
+    better side. Rank 1 means that no method is significantly better, rank 3 that two are. With too
+    few episodes for an interval (`has_enough_episodes`), all ranks are 1.
 
-    Ranks need not increase with the statistic. Each comparison is at 95 %, without correction for
-    the number of comparisons (``docs/statistics.md``).
+    The order by rank may differ from the order by the statistic. Each comparison is at 95 %,
+    without correction for the number of comparisons (``docs/statistics.md``).
 
     Parameters
     ----------
     scores : method -> environment -> seed -> score
         Environments and seeds must be the same for all methods.
     statistic : callable
-        Statistic to compare and order the methods, as in `stratified_bootstrap`.
-    n_resamples, seed
+        Statistic that orders and compares the methods, as in `stratified_bootstrap`.
+    n_resamples, seed : int
         As in `stratified_bootstrap`.
 
     Returns
     -------
-    method -> rank; best first by the statistic.
+    method -> rank, in the order of the statistic, the best first.
 
     Raises
     ------
@@ -67,12 +67,12 @@ def shared_ranks(scores: Mapping[str, Scores], *,
 
 
 def agent_name(method: str) -> str:
-    """Return the name of an agent without its training seed."""
+    """Return the name of an agent without its training seed: ppo_seed4 -> ppo."""
     return re.sub(r"_seed\d+$", "", method)
 
 
 def mean_by_seed(scores: Sequence[Mapping[str, float]]) -> dict[str, float]:
-    """Return seed -> mean over the trainings of an agent, of the seeds that all of them have."""
+    """Return episode seed -> mean over an agent's training seeds, if all of them have a score."""
     return {seed: float(np.mean([own[seed] for own in scores])) for seed in scores[0]
             if all(seed in own for own in scores)}
 
@@ -82,8 +82,8 @@ def _strata(scores: Mapping[str, Scores]) -> dict[str, list[np.ndarray]]:
     first = {name: set(own) for name, own in next(iter(scores.values())).items()}
     for method, own in scores.items():
         if {name: set(each) for name, each in own.items()} != first:
-            raise ValueError("scores must be of the same episodes in the same environments for all "
-                             f"methods, got others of {method}")
+            raise ValueError("scores of all methods must be of the same episodes in the same "
+                             f"environments, got different ones of {method}")
     strata = {method: [np.array([own[name][key] for key in sorted(own[name])], dtype=float)
                        for name in sorted(own)] for method, own in scores.items()}
     if not first or not all(len(each) and np.isfinite(each).all()

@@ -36,7 +36,6 @@ from eitbench.bench.episode_table import read_episode_table, table_path
 from eitbench.data.seeds import format_seed, parse_seeds
 
 SCHEMA = 3
-BOARDS = tracks.ALL_SUBTRACKS
 COMMON_FIELDS = ("environment", "method", "board", "title", "parameters", "role", "privileged",
                  "version", "method_sha256", "checkpoint_sha256")
 """Fields that all episodes of a record share."""
@@ -242,14 +241,10 @@ def _lineage(record: dict[str, Any]) -> tuple[str, ...]:
 # -- checks -------------------------------------------------------------------------------------
 
 
-def schema_text() -> str:
-    """Return the published schema."""
-    return (bundled_path("leaderboards") / "schema.json").read_text(encoding="utf-8")
-
-
 @lru_cache(maxsize=1)
 def _validator() -> Any:
-    return jsonschema_rs.validator_for(json.loads(schema_text()))
+    schema = bundled_path("leaderboards") / "schema.json"
+    return jsonschema_rs.validator_for(json.loads(schema.read_text(encoding="utf-8")))
 
 
 def check_record(record: Any) -> None:

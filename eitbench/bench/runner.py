@@ -14,18 +14,21 @@ from threadpoolctl import threadpool_limits
 from tqdm import tqdm
 
 from eitbench import _check, scoring
+from eitbench.bench.isolation import Worker
 from eitbench.bench.measured import MeasuredRun
 from eitbench.bench.methods import Method, load_method
 from eitbench.bench.scores import Outcome
 from eitbench.bench.tracks import Environment, check_track, is_measured, subtrack_of
 from eitbench.data.episode_cache import region_operators, truth_mesh
-from eitbench.data.episodes import simulate
+from eitbench.data.episodes import cached_truth_model, simulate
 from eitbench.data.seeds import allow_test_seeds
 from eitbench.envs.estimation import EstimationEnv
 from eitbench.envs.injection import InjectionEnv
 from eitbench.estimation import best_homogeneous
 from eitbench.estimation.walk import RandomWalk
+from eitbench.physics.cross_section import outlet_of
 from eitbench.physics.stationary import StationaryTransport
+from eitbench.physics.transport import ConvectionDiffusion
 from eitbench.worlds.random_streams import episode_streams, generator_from_state
 from eitbench.worlds.registry import entry
 from eitbench.worlds.task import Estimate, Task
@@ -35,11 +38,11 @@ if TYPE_CHECKING:
     from eitbench.envs.measured import MeasuredEnv
 
 Step = tuple[int, Estimate | None, dict[str, np.ndarray], float]
-"""t of an estimate, the estimate, the last measurement, and the estimator's time in s."""
+"""t of the estimate, the estimate, the last voltages and currents, and the computing time in s."""
 
 
 class EpisodeRun(NamedTuple):
-    """A finished episode."""
+    """Results of a method in one episode."""
 
     outcome: Outcome
     currents: np.ndarray
@@ -69,7 +72,7 @@ def _cached_environment(asked: Environment, world: World | None, settings: str) 
 
 
 def is_compatible(method: Method, env: Any) -> bool:
-    """Return whether an environment is of one of a method's subtracks and compatible with it."""
+    """Return whether a method supports the subtrack and the task or rules of an environment."""
     known = env.rules if isinstance(env, InjectionEnv) else env.task
     return subtrack_of(env) in method.subtracks and method.suits(known)
 
@@ -79,6 +82,8 @@ def run_method(asked: Environment, method: Method, seed: int) -> EpisodeRun:
     method, or the method is incompatible with it or returns an invalid value."""
     check_track(asked.id, method.track)
     env = cached_environment(asked)
+    if isinstance(method.make, Worker):
+        method.make.ensure_started()                # before computing time is measured
     if isinstance(env, InjectionEnv):
         return _run_policy(env, method, seed)
     if is_measured(asked.id):
@@ -93,7 +98,7 @@ def run_on_measurements(env: MeasuredEnv, method: str | Method, seed: int = 0, *
     """Run an estimator, built-in or given by a path, on measurements.
 
     ``seed`` determines the withheld measurements; estimates are stored for the steps ``kept``, by
-    default all. ``ValueError`` if the method is incompatible or returns an invalid estimate.
+    default all. ``ValueError`` if the method is incompatible or an estimate is invalid.
     """
     if isinstance(method, str):
         method = load_method(method, "estimation")
@@ -134,9 +139,9 @@ class EstimatorOutput:
         self.velocities = np.tile(task.velocity.nominal if task.velocity else (), (task.n_steps, 1))
         """(T, k) parameters of the flow in m/s; k = 0 if the task specifies the flow"""
         self.innovations: dict[int, tuple[np.ndarray, np.ndarray]] = {}
-        """measurement i -> (ν, S)"""
+        """i of a measurement vector -> ν (L,) in V and S (L, L) in V²"""
         self.seconds: list[float] = []
-        """time of each update; the first includes the constructor"""
+        """computing time of each update in s; the first includes the constructor"""
         measured = []
         for t, estimate, measurement, elapsed in steps:
             measured.append(measurement)
@@ -157,7 +162,7 @@ class EstimatorOutput:
         self.voltages, self.currents = (
             np.array([each[key] for each in measured[:task.n_steps]])
             for key in ("voltages", "currents"))
-        """(T, L) V, and A"""
+        """(T, L) V, and (T, L) A (A/m in 2D)"""
         self.has_std = bool(np.isfinite(self.variances[task.warm_up:]).all())
         """True if every scored state has a variance"""
 
@@ -198,7 +203,30 @@ class EstimatorOutput:
             mean=mean, truth=truth, mass=mass,
             points=truth_mesh(env.world).points, homogeneous=homogeneous,
             voltages_measured=self.voltages[states], voltages_predicted=computed,
-            innovations=innovations, std=std, velocity=velocity)
+            innovations=innovations, std=std, velocity=velocity,
+            solute_flow=_solute_flow(env, self.means[states], self.velocities[states]))
+
+
+def _solute_flow(env: EstimationEnv, means: np.ndarray, velocities: np.ndarray,
+                 ) -> tuple[np.ndarray, np.ndarray] | None:
+    """Return the estimated and the true flow of solute through the outlet (S,) in mol/s, for means
+    (S, n) and flow parameters (S, k) of the scored states; None without a flow through the vessel.
+    """
+    task, world = env.task, env.world
+    model, truth = task.transport, cached_truth_model(world).transport
+    if not (isinstance(model, ConvectionDiffusion) and isinstance(truth, ConvectionDiffusion)
+            and model.inlet.size):
+        return None
+    drawn = world.flow.draw(world, episode_streams(env.core.seeds[0]).flow)
+    outlet = outlet_of(model)
+    estimated = [outlet.solute_flow(mean, task.velocity.field(parameters) if task.velocity
+                                    else model.velocity)
+                 for mean, parameters in zip(means, velocities, strict=True)]
+    outlet = outlet_of(truth)
+    first = task.warm_up + 1
+    true = [outlet.solute_flow(concentration, drawn(t) if drawn else truth.velocity)
+            for t, concentration in enumerate(env.truth()[task.warm_up:], first)]
+    return np.array(estimated), np.array(true)
 
 
 def _run_policy(env: InjectionEnv, policy: Method, seed: int) -> EpisodeRun:
@@ -233,7 +261,7 @@ def _run_policy(env: InjectionEnv, policy: Method, seed: int) -> EpisodeRun:
 
 def iter_injections(env: InjectionEnv, policy: Method, seed: int,
                     ) -> Iterator[tuple[int, dict[str, np.ndarray], float, Any, float]]:
-    """Yield (t of the observed state, observation, seconds of the policy, its action, JSON-ready,
+    """Yield (t, observation of state t, computing time of the policy in s, its action, JSON-ready,
     and the reward) after each injection of one episode. The first time includes the policy's
     constructor. Errors as in `run_method`."""
     if not policy.suits(env.rules):
@@ -272,7 +300,7 @@ def iter_estimates(env: EstimationEnv, estimator: Method,
 
 def _iter_steps(env: EstimationEnv | MeasuredEnv, estimator: Method, seed: int,
                 ) -> Iterator[Step]:
-    """Yield (t = i − lag, estimate, measurement i, seconds of the estimator) at each step i."""
+    """Yield (t = i − lag, estimate, measurement i, computing time in s) at each step i."""
     with allow_test_seeds():
         observation, _ = env.reset(seed=seed)
     if estimator.privileged and not isinstance(env, EstimationEnv):

@@ -60,6 +60,8 @@ class Outcome:
     """(S, m) mol/m³, if every scored state has a variance"""
     velocity: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None
     """(S, p) estimated and true m/s, and weights (p,), where the task includes the flow"""
+    solute_flow: tuple[np.ndarray, np.ndarray] | None = None
+    """(S,) estimated and true flow of solute through a pipe's outlet, mol/s (mol/(s·m) in 2D)"""
     mean_nis: float | None = None
     """NIS/m of measurements"""
     ktc: float | None = None
@@ -116,14 +118,11 @@ class Score:
         if not self.name.isidentifier() or self.name != self.name.lower() or self.name[0] == "_":
             raise ValueError("name must be of lower-case letters, digits and underscores, got "
                              f"{self.name!r}")
-        if self.direction not in SCORE_DIRECTIONS:
-            raise ValueError(f"direction must be one of {', '.join(SCORE_DIRECTIONS)}, got "
-                             f"{self.direction!r}")
+        _check.choice("direction", self.direction, SCORE_DIRECTIONS)
         for argument, values, allowed in (("requires", self.requires, Outcome.__dataclass_fields__),
                                           ("tracks", self.tracks, KINDS)):
-            if unknown := [each for each in values if each not in allowed]:
-                raise ValueError(f"{argument} must be among {', '.join(allowed)}; got "
-                                 f"{', '.join(map(repr, unknown))}")
+            for each in values:
+                _check.choice(f"each of {argument}", each, allowed)
         _check.number("factor", self.factor, low=0.0, open_low=True)
 
     def __call__(self, outcome: Outcome) -> float | None:
@@ -186,6 +185,16 @@ def _velocity_error(outcome: Any) -> float:
     return scoring.relative_error(estimated, true, np.diag(weights))
 
 
+def _solute_flow_error(outcome: Any) -> float:
+    estimated, true = outcome.solute_flow
+    return float(np.sqrt(((estimated - true)**2).sum() / (true**2).sum()))
+
+
+def _solute_amount_error(outcome: Any) -> float:
+    estimated, true = outcome.solute_flow
+    return float(abs(estimated.sum() / true.sum() - 1.0))
+
+
 def _nis(outcome: Any) -> float | None:
     """Mean of νᵀS⁻¹ν/m over injections, with the m accepted measurements of each."""
     if outcome.innovations is None:
@@ -215,8 +224,8 @@ for _score in (
           "true segmentation, 1 if equal",
           lambda outcome: outcome.ktc, direction="higher", tracks=("measured",)),
     Score("contrast_error", "contrast",
-          "error relative to the deviation of the truth from the homogeneous estimate; the "
-          "homogeneous estimate has 1",
+          "error relative to the deviation of the truth from the homogeneous estimate of the whole "
+          "episode, which has 1",
           _contrast_error, requires=("mean", "truth")),
     Score("nis", "NIS/m",
           "normalised innovation squared of all scored measurements; 1 if the filter's uncertainty "
@@ -228,6 +237,12 @@ for _score in (
           "relative error of the flow, ∫(v̂ − v)²/∫v² across the pipe, where the task includes the "
           "flow",
           _velocity_error, requires=("velocity",)),
+    Score("solute_flow_error", "flow error",
+          "relative RMS error of the solute flow through the outlet, ∫ĉ v̂·n against ∫c v·n",
+          _solute_flow_error, requires=("solute_flow",)),
+    Score("solute_amount_error", "amount error",
+          "relative error of the amount of solute that leaves the pipe during the scored states",
+          _solute_amount_error, requires=("solute_flow",)),
     Score("coverage_50", "50 %", "fraction of the truth inside the reported 50 % interval",
           lambda outcome: scoring.coverage(*_uncertainty(outcome), 0.5),
           direction="nominal", requires=("std",), tracks=TRACKS),

@@ -1,4 +1,4 @@
-"""Episode store: results of a run on disk, one file per episode, from which records are built."""
+"""Episode store: one file per method and episode of a run, from which records are built."""
 
 from __future__ import annotations
 
@@ -45,8 +45,8 @@ _OUTPUTS = ("--out", "-o", "--to")
 
 
 class EpisodeStore:
-    """Results of a run in a folder: ``episodes/ENV/METHOD/SEED.json``, with the estimates in
-    ``SEED.npz``.
+    """Episode results of a run in a folder: ``episodes/ENV/METHOD/SEED.json``, with the estimates
+    in ``SEED.npz``.
 
     A result is a dictionary: the scores of one method in one episode, with environment, versions
     and status ("ok" or a failure). Files are written atomically, so several runs may share a folder
@@ -69,7 +69,7 @@ class EpisodeStore:
         write_atomically(path, json.dumps(result, indent=1, allow_nan=False).encode())
 
     def has_result(self, environment: str, method: str, seed: int, identity: str) -> bool:
-        """Return whether a successful result with this ``identity`` (its cache key) is stored."""
+        """Return whether a successful result with the cache key ``identity`` is stored."""
         try:
             result = self.result(environment, method, seed)
         except ValueError:
@@ -122,9 +122,9 @@ class EpisodeStore:
     def records(self, also: Iterable[dict[str, Any]] = ()) -> list[dict[str, Any]]:
         """Build one record per environment, method and split of the seeds, without validation.
 
-        Only those stored results are used that have the method's file and the `declared_versions`
-        of the most recent one. ``also`` are results of other records: if they have the same version
-        of the method, they replace missing and failed episodes.
+        Stored results are ignored if their method's file or `declared_versions` differ from the
+        most recent result. ``also`` are results of other records: if they have the same version of
+        the method, they replace missing and failed episodes.
         """
         own, others = _by_record(self.results()), _by_record(also)
         records = []
@@ -159,7 +159,7 @@ _Groups = dict[tuple[str, str, str], list[dict[str, Any]]]
 
 
 def _by_record(results: Iterable[dict[str, Any]]) -> _Groups:
-    """Group results by environment, method and split."""
+    """Group results by environment, method and split, as in records."""
     groups: _Groups = {}
     for result in results:
         key = (result["environment"]["name"], result["method"], split_of(result["seed"]))
@@ -172,7 +172,7 @@ def _latest(results: list[dict[str, Any]]) -> dict[str, Any]:
 
 
 def _code(result: dict[str, Any]) -> tuple[Any, ...]:
-    """Return the method's file and the declared versions."""
+    """Return the sha256 of the method's file, and the declared versions."""
     versions = result["run"]["versions"]
     return result["method_sha256"], *map(versions.get, declared_versions())
 
@@ -214,8 +214,8 @@ def folder_results(folder: Path) -> list[dict[str, Any]]:
 
 
 def _read(path: Path) -> dict[str, Any]:
-    """Read a result. ``ValueError``, whose message does not name the file, if the result is damaged
-    or does not yield a valid record."""
+    """Read a result; ``ValueError`` if it is damaged or does not yield a valid record, with a
+    message that does not name the file."""
     result = read_json(path)
     try:
         check_record(_gathered([result]))
@@ -235,7 +235,7 @@ def declared_versions() -> dict[str, str]:
 
 @lru_cache(maxsize=1)
 def provenance() -> dict[str, Any]:
-    """Return package versions, BLAS library and git commit of this process."""
+    """Return package versions, BLAS library, git commit, and whether the checkout has changes."""
     # changes in `leaderboards` do not count: it holds results
     status = _git("--no-optional-locks", "status", "--porcelain", "--", ".", ":!leaderboards")
     config: Any = np.show_config(mode="dicts")  # type: ignore[call-overload]
@@ -269,8 +269,8 @@ def _portable(word: str) -> str:
 
 @lru_cache(maxsize=1)
 def machine() -> dict[str, Any]:
-    """Return processor, number of cores, operating system and speed of the machine of this process;
-    in a cluster it may differ from the machine that started the run.
+    """Return processor, number of cores, operating system and speed of the machine of this process,
+    in a cluster the machine of the worker.
 
     The speed is the time in s of a product of two 1000 × 1000 matrices in double precision on one
     thread (median of three). Computing times relative to it can be compared between machines.

@@ -35,11 +35,8 @@ def submit(method: str | None, environments: list[str], seeds: list[int] | None,
         where = f"and changes to {code['commit'][:8]}" if code["commit"] else "outside a checkout"
         raise ValueError("official must be False unless this is a commit without changes, got "
                          f"official=True {where}")
-    split = "test"
-    outside = [format_seed(seed) for seed in seeds or [] if split_of(format_seed(seed)) != split]
-    if outside:
-        raise ValueError(f"seeds of a submission must be of the split {split}, got "
-                         f"{', '.join(outside)}")
+    if others := sorted({split_of(format_seed(seed)) for seed in seeds or ()} - {"test"}):
+        raise ValueError(f"seeds must be of the split test, got {', '.join(others)}")
     if method is not None and not environments:
         raise ValueError("env must name at least one environment to submit for")
     asked: Iterable[list[Job]] = (_jobs(method, id, policy, seeds, isolate, official)
@@ -47,26 +44,25 @@ def submit(method: str | None, environments: list[str], seeds: list[int] | None,
     if method is not None:
         asked = list(asked)
         for jobs in asked:
-            _earlier(Path(to), jobs, split, official)
+            _earlier(Path(to), jobs, official)
     else:
         for id in environments:
             tracks.track_of(id)
     return (path for jobs in asked
-            for path in _submitted(jobs, store, Path(to), split, official, n_jobs, backend,
-                                   command))
+            for path in _submitted(jobs, store, Path(to), official, n_jobs, backend, command))
 
 
-def _submitted(jobs: list[Job], store: EpisodeStore, to: Path, split: str, official: bool,
-               n_jobs: int, backend: str, command: str) -> Iterator[Path]:
+def _submitted(jobs: list[Job], store: EpisodeStore, to: Path, official: bool, n_jobs: int,
+               backend: str, command: str) -> Iterator[Path]:
     """Run the jobs of one environment and write their records."""
-    earlier = _earlier(to, jobs, split, official)
+    earlier = _earlier(to, jobs, official)
     before = [result for record in earlier.values() if record["official"] == official
               for result in record_results(record)]
     run_jobs(pending_jobs(jobs, before), store, n_jobs=n_jobs, backend=backend, command=command)
     asked = _versions(jobs)
     made = [record | {"official": official} for record in store.records(also=before)
             if (record["environment"]["name"], record["method"], record["version"]) in asked
-            and record["split"] == split]
+            and record["split"] == "test"]
     found = {(record["environment"]["name"], record["method"]) for record in made}
     for environment, method, _ in asked:
         if (environment, method) not in found:
@@ -96,12 +92,12 @@ def _versions(jobs: list[Job]) -> list[tuple[str, str, str]]:
                               for job in jobs))
 
 
-def _earlier(to: Path, jobs: list[Job], split: str, official: bool) -> dict[Path, dict[str, Any]]:
+def _earlier(to: Path, jobs: list[Job], official: bool) -> dict[Path, dict[str, Any]]:
     """Read the records in ``to`` of the jobs' versions of methods. ``ValueError`` if one of them is
     official and the new one is not."""
     found = {}
     for environment, method, version in _versions(jobs):
-        name = tracks.record_name(environment, method, version, split)
+        name = tracks.record_name(environment, method, version, "test")
         if (path := to / name).exists():
             found[path] = read_record(path)
             if found[path]["official"] and not official:

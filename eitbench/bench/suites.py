@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from eitbench import _check
 from eitbench.bench import tracks
 from eitbench.bench.isolation import choose_isolation
 from eitbench.bench.methods import (
@@ -39,9 +40,7 @@ def make_jobs(track: str, environments: list[str], methods: list[str],
     `isolation.choose_isolation`. ``ValueError`` if an environment or method is unknown, a given
     method is compatible with none of the environments, or two methods have the same name.
     """
-    if estimator not in tracks.ONBOARD_FILTERS:
-        raise ValueError(f"estimator must be one of {', '.join(tracks.ONBOARD_FILTERS)}, got "
-                         f"{estimator!r}")
+    _check.choice("estimator", estimator, tracks.ONBOARD_FILTERS)
     given = {} if estimator == "full" else {"estimator": estimator}
     for method in methods:
         find_method(method, track)
@@ -50,6 +49,7 @@ def make_jobs(track: str, environments: list[str], methods: list[str],
         environments = list(tracks.QUICK_IDS) if quick else tracks.ids(track)
     todo = []
     fitting = set[str]()
+    trained_in = dict[str, Any]()
     for id, changes in itertools.product(environments, worlds):
         tracks.check_track(id, track)
         arguments = given | ({"world": changes} if changes else {})
@@ -69,10 +69,12 @@ def make_jobs(track: str, environments: list[str], methods: list[str],
             if (other := names.setdefault(loaded.name, method)) != method:
                 raise ValueError(f"{other} and {method} have the same name, under which results "
                                  "are stored; rename one")
+            trained_in[method] = loaded.parameters.get("env")
             if not skipped and is_compatible(loaded, env):
                 fitting.add(method)
                 todo += [job._replace(seed=seed) for seed in numbers]
-    if missing := [method for method in methods if method not in fitting]:
+    if missing := [f"{method} (trained in {trained_in[method]})" if trained_in[method] else method
+                   for method in methods if method not in fitting]:
         raise ValueError(f"{METHOD_KINDS[track].kind} {', '.join(missing)} suits none of the "
                          f"environments {', '.join(environments)}; see `eitbench list`")
     return todo

@@ -24,25 +24,25 @@ def mean_and_interval(values: list[float]) -> tuple[float, float]:
 
 
 def format_mean(mean: float, half: float) -> str:
-    """Format as ``0.0053 ± 0.0004``: one digit of the interval (two if the first is 1)."""
-    place = _places(half)
+    """Format as ``0.0053 ± 0.0004``: one digit of the interval, two if it or the mean needs two."""
+    place = _places(half, mean)
     return f"{mean:.3g}" if place is None else f"{mean:z.{place}f} ± {half:.{place}f}"
 
 
 def format_interval(value: float, low: float, high: float) -> str:
     """Format as ``0.0053 (0.0049 to 0.0058)``, without the interval if it is infinite."""
-    place = _places(0.5 * (high - low))
+    place = _places(0.5 * (high - low), value)
     if place is None:
         return f"{value:.3g}"
     return f"{value:z.{place}f} ({low:z.{place}f} to {high:z.{place}f})"
 
 
-def _places(half: float) -> int | None:
-    """Return the decimal places for half an interval; None if it is infinite or below the last."""
+def _places(half: float, value: float) -> int | None:
+    """Return the decimal places of a value and half its interval; None if infinite or too small."""
     if not math.isfinite(half) or half < 5e-6:
         return None
     place = -math.floor(math.log10(half))
-    if round(half * 10**place) == 1:
+    if round(half * 10**place) == 1 or 1 <= abs(value) * 10**place < 10:
         place += 1
     return min(max(place, 0), 5)
 

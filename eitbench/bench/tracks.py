@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import gymnasium as gym
 from gymnasium.envs.registration import load_env_creator
 
+from eitbench import _check
 from eitbench.data.seeds import parse_seeds
 from eitbench.worlds.registry import entries, entry
 
@@ -28,7 +29,7 @@ CATEGORIES = ("filter", "fixed-lag", "smoothing", "stationary", "injection")
 NAIVE_BASELINES = {"estimation": "homogeneous", "injection": "random_pair"}
 """Naive baselines: they define a leaderboard's episodes and the zero of its skill score."""
 ONBOARD_FILTERS = ("full", "reduced")
-"""Filters inside an injection environment: the exact one for scores, the reduced for training."""
+"""Filters inside an injection environment: the full one for scores, the reduced for training."""
 
 MEASURED = "eitbench.envs.measured:case_env"
 """Entry point of the ids of measured cases."""
@@ -40,7 +41,7 @@ QUICK_IDS = ("eitbench/Pipe2D-v0", "eitbench/Pipe2DFixedLag-v0", "eitbench/Pipe2
 """Environments of the quick suite; the full suite has all of the track estimation."""
 QUICK_SEEDS = "test:0-3"
 RUN_KWARGS = {"estimation": {}, "injection": {"estimator": "full", "observation": "raw"}}
-"""Default arguments of each track's environments in runs: the exact filter and unscaled
+"""Default arguments of each track's environments in runs: the full filter and unscaled
 observations. Registered ids have other defaults, for training."""
 
 
@@ -81,9 +82,7 @@ class Environment(NamedTuple):
         """Make the environment without gymnasium's wrappers; ``ValueError`` if the id is unknown or
         an argument is invalid."""
         arguments = RUN_KWARGS[self.track] | json.loads(self.kwargs) | extra
-        if arguments.get("estimator", "full") not in ONBOARD_FILTERS:
-            raise ValueError(f"estimator must be one of {', '.join(ONBOARD_FILTERS)}, got "
-                             f"{arguments['estimator']!r}")
+        _check.choice("estimator", arguments.get("estimator", "full"), ONBOARD_FILTERS)
         made: Any = gym.make(self.id, disable_env_checker=True, **arguments).unwrapped
         return made
 
@@ -128,8 +127,7 @@ def nominal_id(id: str) -> str:
 def check_track(id: str, track: str) -> None:
     """Raise ``ValueError`` if an environment is unknown or of another track."""
     if track_of(id) != track:
-        raise ValueError(f"environment {id} is not of the track {track}; env must be one of "
-                         f"{', '.join(ids(track))}")
+        raise ValueError(f"environment {id} is not of the track {track}; see `eitbench list`")
 
 
 def registered_kwargs(id: str) -> dict[str, Any]:
@@ -177,9 +175,7 @@ def subtracks_of(id: str, kwargs: dict[str, Any]) -> tuple[str, ...]:
     track = track_of(id)
     known = _parameters(id) if kwargs else ()
     for name, value in kwargs.items():
-        if name not in known:
-            raise ValueError(f"{name} is not an argument of {id}; it must be one of "
-                             f"{', '.join(known)}")
+        _check.choice(f"argument of {id}", name, known)
         if name in ("world", "assume") and not isinstance(value, dict | None):
             raise ValueError(f"{name} must be an object, got {type(value).__name__}")
     if track == "injection":

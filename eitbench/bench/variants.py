@@ -50,16 +50,10 @@ def format_setting(value: Any) -> str:
 def _values(text: str) -> list[Any]:
     """Parse ``0.01,0.02`` as two numbers, ``[1, 2]`` as one list, ``a,b`` as two words."""
     try:
-        return list(json.loads(f"[{text}]"))
+        return list(json.loads(f"[{text}]")) or [""]
     except ValueError:
-        return [_value(word) for word in text.split(",")]
-
-
-def _value(word: str) -> Any:
-    try:
-        return json.loads(word)
-    except ValueError:
-        return word
+        words = text.split(",")
+        return words if len(words) == 1 else [each for word in words for each in _values(word)]
 
 
 def _nested(settings: Iterable[tuple[str, Any]]) -> dict[str, Any]:

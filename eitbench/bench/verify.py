@@ -158,10 +158,11 @@ def job_for_record(record: dict[str, Any], file: str | None = None, isolate: str
     if is_builtin(method) and not (built_in and path.samefile(built_in)):
         raise ValueError(f"{path} must be the method of the record, {record['method']}, got "
                          "another built-in method")
-    sha256 = method_sha256(method_files(path))
+    contents = method_files(path)
+    sha256 = method_sha256(contents)
     if sha256 != record["method_sha256"] and not is_builtin(method):
-        raise ValueError(f"the sha256 of {path.name} is {sha256}, but {record['method_sha256']} in "
-                         "the record")
+        raise ValueError(f"the sha256 of {' and '.join(contents)} is {sha256}, but "
+                         f"{record['method_sha256']} in the record")
     return isolated_job(environment, method, isolate, strict=True)
 
 
@@ -311,12 +312,13 @@ def _relative(a: Sequence[float | None], b: Sequence[float | None]) -> float:
 
 
 def describe_problems(rows: pd.DataFrame, tolerance: float = SCORE_TOLERANCE) -> list[str]:
-    """Return a sentence for each episode whose rerun differs from its record."""
+    """Return a line for each episode whose rerun differs, and each record without a rerun."""
     sentences = []
     for _, row in rows[_differ(rows, tolerance)].iterrows():
         what = row["problem"] or (f"{row['score']} differs by {row['difference']:.2g} (relative); "
                                   f"error {row['rerun']}, in the record {row['recorded']}")
-        where = f"{row['record']}, {row['episode']}" if row["episode"] else row["record"]
+        where = (f"differs: {row['record']}, {row['episode']}" if row["episode"]
+                 else f"not verified: {row['record']}")
         sentences.append(f"{where}: {what}" + (f" ({row['note']})" if row["note"] else ""))
     return list(dict.fromkeys(sentences))
 

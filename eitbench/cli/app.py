@@ -39,7 +39,7 @@ def _main(
 @app.command("list")
 def list_() -> None:
     """List environments, built-in estimators and policies, with their subtracks."""
-    from eitbench.bench.methods import builtin_methods, load_method
+    from eitbench.bench.methods import builtin_methods, builtin_summary
     from eitbench.bench.tracks import ids, measured_ids, subtracks_of
     from eitbench.worlds.registry import GROUPS, entry, published_returns
     from eitbench.worlds.task import lag_steps
@@ -55,7 +55,7 @@ def list_() -> None:
             if schedule.budget is not None:
                 about += f", at most {schedule.budget} injections"
             if each.nominal:
-                about += f", shifted variant {each.variant} of {each.nominal}"
+                about += f", shifted environment, variant {each.variant} of {each.nominal}"
             if returns := published_returns(name):
                 about += ", returns " + ", ".join(f"{row['group']} {float(row['mean']):.3g}"
                                                   for row in returns)
@@ -66,8 +66,8 @@ def list_() -> None:
               for name in measured_ids()]
     for track, heading in (("estimation", "estimators"), ("injection", "policies")):
         lines.append((heading, "", ""))
-        lines += [(f"  {name}", ", ".join((method := load_method(name, track)).subtracks),
-                   method.title) for name in builtin_methods(track)]
+        lines += [(f"  {name}", ", ".join(subtracks), title) for name in builtin_methods(track)
+                  for title, subtracks in [builtin_summary(name, track)]]
     for name, boards, about in lines:
         options.echo(f"{name:42} {boards:30}  {about}".rstrip())
 
@@ -202,7 +202,8 @@ def compare(
     score: Annotated[str, typer.Option(help="Score to compare.")] = "error",
 ) -> None:
     """Compare two methods seed by seed: differences with intervals, and the fraction of episodes in
-    which A is better. Several environments are compared by skill scores, as on the leaderboards."""
+    which A is better. The errors of several environments are aggregated as skill scores,
+    without shifted environments."""
     from eitbench.report import compare as comparison
     with options.cli_errors():
         ours, theirs = ([record for record in comparison.find_records(name, records)

@@ -19,7 +19,7 @@ def estimate(
     vessel: Annotated[Path, typer.Option(help="YAML file that describes the vessel.")],
     baseline: Annotated[list[str], typer.Option(
         "--baseline", help="Estimator name or path; may be repeated. The first is drawn.")],
-    out: Annotated[Path, typer.Option("--out", "-o", help="Page to write.")] = Path("report.html"),
+    out: Annotated[Path, typer.Option("--out", "-o", help="HTML report.")] = Path("report.html"),
     arrays: Annotated[Path | None, typer.Option(
         help="Also write all estimates of the first method to this npz file; needs memory for "
              "all of them.")] = None,
@@ -30,20 +30,20 @@ def estimate(
                          "reference=VARIABLE for an EIDORS file, or frequency=1e4 for Sciospec "
                          "files; may be repeated.")] = None,
     withheld: Annotated[float, typer.Option(
-        min=0.0, max=0.5, help="Fraction of the measurements withheld from the methods, which "
-                               "scores them.")] = 0.1,
+        min=0.0, max=0.5, help="Fraction of the measurements withheld from the methods; their "
+                               "residuals are the score.")] = 0.1,
     span: Annotated[str | None, typer.Option(
         help="Only time steps FIRST:LAST, counted from 0, LAST excluded.")] = None,
     seed: Annotated[int, typer.Option(min=0, help="Random seed of withheld measurements.")] = 0,
     truth: Annotated[Path | None, typer.Option(
         help="Ground truth in a round tank, in the format of KTC: variable truth of a .mat file, "
              "256 × 256 pixels 0 (water), 1 (resistive), 2 (conductive).")] = None,
-    still: Annotated[bool, typer.Option("--still", help="The target does not move.")] = False,
+    still: Annotated[bool, typer.Option("--still", help="The target is stationary.")] = False,
     correction: Annotated[str, typer.Option(
         help="Correction of the misfit on homogeneous fluid: subtract an offset or divide by a "
              "channel gain (offset or gain), or none for absolute images.")] = "offset",
     homogeneous_frames: Annotated[int, typer.Option(
-        min=1, help="Number of initial homogeneous frames, used without a reference.")] = 1,
+        min=1, help="Number of initial frames that replace a missing reference frame.")] = 1,
 ) -> None:
     """Estimate the concentration in a real tank or pipe: calibrate the vessel, run methods, and
     write a report with estimates, residuals of withheld measurements and data-quality warnings."""

@@ -6,7 +6,7 @@ import importlib
 import os
 import shutil
 import sys
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from enum import StrEnum
 from pathlib import Path
@@ -115,12 +115,3 @@ def cli_errors() -> Iterator[None]:
     except ValueError as error:
         echo(f"error: {error}", err=True)    # not in a box, which would break paths
         raise typer.Exit(2) from error
-
-
-def report_differences(sentences: Iterable[str]) -> None:
-    """Print differences, one per line, and exit with status 1 if there are any."""
-    wrong = list(sentences)
-    for sentence in wrong:
-        echo(f"differs: {sanitize(sentence)}", err=True)
-    if wrong:
-        raise typer.Exit(1)

@@ -8,6 +8,8 @@ from typing import Annotated, Any
 
 import typer
 
+from eitbench._files import resolve_input
+from eitbench._sanitize import sanitize
 from eitbench.cli import options
 
 
@@ -46,9 +48,10 @@ def verify(
 ) -> None:
     """Rerun episodes of records and compare all deterministic scores.
 
-    Exit status 0 if all agree, 1 if one differs, 2 for invalid arguments. Episodes are simulated
-    again; the cache is not used. A third-party method's file must have the record's sha256, and
-    runs under bubblewrap unless --isolate process is given. Standard output is Markdown.
+    Exit status 0 if all agree, 1 if one differs or cannot be rerun, 2 for invalid arguments.
+    Episodes are simulated again; the cache is not used. A third-party method's file must have the
+    record's sha256, and runs under bubblewrap unless --isolate process is given. Standard output is
+    Markdown.
     """
     import secrets
 
@@ -58,6 +61,8 @@ def verify(
         _check_arguments(paths or [], every, top, episodes, held_out, secret, method)
         key = read_secret(secret) if secret else b""
         chosen = paths or select_records(records, env or [], top=top)
+        if missing := [str(path) for path in chosen if not path.is_file()]:
+            raise ValueError(f"records must be files, got {', '.join(missing)}")
     if every and out is None:
         out = Path("results/verify")
     drawn = 0 if every and seed is None else secrets.randbelow(2**32) if seed is None else seed
@@ -69,7 +74,10 @@ def verify(
                                 "n_jobs": jobs, "backend": backend})
         if held_out:
             problems += _held_out(chosen, Path(temporary), method, isolate, key, held_out)
-    options.report_differences(problems)
+    for problem in problems:
+        options.echo(sanitize(problem), err=True)
+    if problems:
+        raise typer.Exit(1)
     options.echo(f"{len(chosen)} of {len(chosen)} records agree with their reruns")
 
 
@@ -79,6 +87,8 @@ def _check_arguments(paths: list[Path], every: bool, top: int, episodes: int, he
         raise ValueError("one of the files of records, --all and --top must be given")
     if method and len(paths) != 1:
         raise ValueError("--method belongs to one record's file")
+    if method and not resolve_input(Path(method)).is_file():
+        raise ValueError(f"--method must be a file, got {method}")
     if (held_out > 0) != (secret is not None):
         raise ValueError("--held-out and --secret belong together")
     if not episodes and not held_out:
@@ -103,28 +113,10 @@ def _held_out(paths: list[Path], folder: Path, method: str | None, isolate: str,
     """Print the table of held-out episodes and return the problems."""
     import hashlib
 
-    from eitbench.bench.held_out import verify_held_out
-    from eitbench.bench.isolation import WorkerError, close
-    from eitbench.bench.records import read_record
+    from eitbench.bench.held_out import verify_all_held_out
     from eitbench.bench.table import Table
-    from eitbench.bench.verify import job_for_record, submitted_methods_folder
-    from eitbench.data.cache import use_cache_dir
-    rows: list[dict[str, Any]] = []
-    problems: list[str] = []
-    with use_cache_dir(folder / "held-out"):
-        for path in paths:
-            try:
-                record = read_record(path)
-                job = job_for_record(record, method, isolate, submitted_methods_folder(path))
-                row, found = verify_held_out(record, job, secret, episodes)
-            except (ValueError, WorkerError) as error:
-                row, found = {}, [str(error)]
-            rows += [{"error relative to the naive baseline": path.stem} | row] if row else []
-            problems += [f"{path.name}: {sentence}" for sentence in found]
-        close()
+    rows, problems = verify_all_held_out(paths, folder, method, isolate, secret, episodes)
     digest = hashlib.sha256(secret).hexdigest()
     table = Table.of(rows).markdown() if rows else ""
     options.echo(f"held-out episodes of the secret with sha256 {digest}\n\n{table}\n")
-    return problems
-
-
+    return [f"differs: {problem}" for problem in problems]

@@ -1,10 +1,10 @@
 """Cached episodes: transfer resistances, noise and scoring integrals of all or the first steps.
 
-Scores need two integrals and one vector on the estimators' nodes per step, without the mesh of the
-truth. Let P be the interpolation from these nodes to the truth's, M the truth's mass matrix over
-the scored region, and all concentrations relative to the world's background. Then
+With one vector and two integrals per step, scores do not need the mesh of the truth. Let P be the
+interpolation from the estimators' nodes to the truth's, M the truth's mass matrix over the scored
+region (the whole vessel, or `World.region`), and c and ĉ differences from the background. Then
     ∫(ĉ − c)² = ĉᵀ M̃ ĉ − 2 ĉᵀ b_t + d_t,      M̃ = Pᵀ M P,   b_t = Pᵀ M c_t,   d_t = c_tᵀ M c_t.
-The scored region is the whole vessel, or `World.region`.
+The second integral is ∫c_t² of the concentration itself, the denominator of the relative error.
 """
 
 from __future__ import annotations
@@ -39,11 +39,11 @@ if TYPE_CHECKING:
 SCORING_VERSION = 1
 """Version of the cached scoring constants and region masses."""
 EXTRA_STEPS = 12
-"""Simulated steps after the first observation: environment checkers take ten."""
+"""Steps that are simulated after the first observation; environment checkers take ten."""
 BUNDLED_SEED = 0
-"""Seed of the episode with a shipped prefix; a growing `EpisodeSampler` starts with it."""
+"""Seed of the episode whose prefix the package ships; a growing `EpisodeSampler` begins with it."""
 CSR_ARRAYS = ("data", "indices", "indptr")
-"""Arrays of a sparse matrix."""
+"""Attributes of a sparse matrix in CSR format."""
 
 
 class ScoringConstants(NamedTuple):
@@ -53,14 +53,14 @@ class ScoringConstants(NamedTuple):
     """(n, n) upper triangle of M̃ over the whole vessel, m² (m³ in 3D), doubled off the diagonal:
     ĉᵀ·mass·ĉ = ĉᵀM̃ĉ."""
     largest_voltage: float
-    """V, largest voltage of the cycle's injections at the expected concentration"""
+    """V, largest voltage of the injection cycle at the expected concentration."""
 
 
 class ScoreIntegrals(NamedTuple):
     """Scoring integrals of an episode over the scored region, t = 1 … T."""
 
     moment: np.ndarray
-    """(T, n) float32, b_t"""
+    """(T, n) b_t, float32"""
     deviation: np.ndarray
     """(T,) ∫(c_t − background)²"""
     square: np.ndarray
@@ -82,7 +82,7 @@ def cached_episode(world: World, seed: int) -> np.ndarray:
     ``moment``               (n,) float32, b_t: scores are exact to 2e-10
     ``deviation``            ∫(c_t − background)²
     ``square``               ∫c_t²
-    ``region_…``             the last three over the world's region, if it has one
+    ``region_…``             moment, deviation, square over the world's region, if it has one
     ``velocity_moment``      (k,) ∫φ_k v_t across the pipe, if the task requests the flow
     ``velocity_square``      ∫v_t², if the task requests the flow
     """
@@ -95,8 +95,8 @@ def cached_episode(world: World, seed: int) -> np.ndarray:
 
 
 def cached_episode_prefix(world: World, seed: int, needed: int) -> np.ndarray:
-    """Return the whole episode if it is cached; otherwise simulate the first ``needed`` steps and
-    some more, in a quarter of the time."""
+    """Return the entries of the whole episode if it is cached; otherwise of its first steps,
+    ``needed`` or more, which are shipped or simulated in a quarter of the time."""
     last = needed + EXTRA_STEPS
     if last >= world.n_steps or is_episode_cached(world, seed):
         return cached_episode(world, seed)
@@ -107,7 +107,7 @@ def cached_episode_prefix(world: World, seed: int, needed: int) -> np.ndarray:
 
 
 def concentration_at(world: World, seed: int, t: int, needed: int) -> np.ndarray:
-    """Return c_t (n_truth,) in mol/m³ on the truth's mesh; ``needed``: see
+    """Return c_t (n_truth,) in mol/m³ on the truth's mesh; ``needed`` steps are simulated as in
     `cached_episode_prefix`."""
     last = needed + EXTRA_STEPS
     is_early = t <= last < world.n_steps and not is_simulated(world, seed)
@@ -150,7 +150,7 @@ def build_cached_episode(world: World, episode: Episode) -> np.ndarray:
 
 
 def step_dtype(world: World, n_nodes: int) -> np.dtype:
-    """Return the type of one step of a cached episode; ``n_nodes``: of the estimators' mesh."""
+    """Return the type of one step of a cached episode, for ``n_nodes`` of the estimators' mesh."""
     L = world.vessel.n_electrodes
     prefixes = ("",) if world.region is None else ("", "region_")
     scores = [(prefix + name, *layout) for prefix in prefixes for name, *layout in (
@@ -163,8 +163,8 @@ def step_dtype(world: World, n_nodes: int) -> np.dtype:
 
 
 def prefix_file(world: World, needed: int = 0) -> cache.File:
-    """Return the file of the shipped prefix: transfer resistances of the first steps that are not
-    scored, at least the ``needed`` ones."""
+    """Return the file of the shipped prefix: transfer resistances of the ``needed`` steps and
+    `EXTRA_STEPS` more, without scored ones."""
     def build() -> dict[str, np.ndarray]:
         steps = min(needed + EXTRA_STEPS, world.warm_up)
         (episode,) = simulate_batch(world.truth_config, [BUNDLED_SEED], False, steps)
@@ -176,8 +176,8 @@ def prefix_file(world: World, needed: int = 0) -> cache.File:
 
 @cache_per_truth(4)
 def _shipped(world: World) -> np.ndarray | None:
-    """Return the shipped steps as entries of a cached episode, with placeholder integrals: these
-    steps are not scored."""
+    """Return the shipped steps as entries of a cached episode, None if the package has none; their
+    integrals are placeholders, since these steps are not scored."""
     arrays = cache.load_shipped(prefix_file(world).key)
     if arrays is None:
         return None
@@ -220,7 +220,7 @@ def integrals(world: World, entries: np.ndarray) -> ScoreIntegrals:
 
 def integrate(episode: Episode, background: float, interpolation: sp.csr_array,
               mass: sp.csr_array) -> ScoreIntegrals:
-    """Compute the integrals of an episode for these P and M."""
+    """Compute the integrals of an episode for ``interpolation`` P and ``mass`` M."""
     c = episode.concentration[1:].astype(float)
     deviation = c - background
     weighted = mass @ deviation.T
@@ -231,7 +231,7 @@ def integrate(episode: Episode, background: float, interpolation: sp.csr_array,
 
 def step_error(mass: sp.csr_array, estimate: np.ndarray, moment: np.ndarray,
                deviation: np.ndarray | float, square: np.ndarray | float) -> np.ndarray:
-    """Return ∫(ĉ_t − c_t)² / ∫c_t² of ``estimate`` (..., n) less the background."""
+    """Return ∫(ĉ_t − c_t)² / ∫c_t² (...,); ``estimate`` (..., n) is ĉ_t minus the background."""
     # Contiguous: otherwise the summation order, and so the last bit, depends on the number of
     # estimates.
     quadratic = np.einsum("...n,...n->...", estimate, np.ascontiguousarray((mass @ estimate.T).T))
@@ -256,7 +256,7 @@ def scoring_constants(world: World) -> ScoringConstants:
 
 
 def scoring_constants_file(world: World) -> cache.File:
-    """Return the file of a world's scoring constants; flow, target and contacts do not matter."""
+    """Return the file of scoring constants; they depend on vessel, prior, current and pattern."""
     def build() -> dict[str, np.ndarray]:
         task = make_task(world.truth_config)
         homogeneous = np.full(task.mesh.n_nodes, world.expected_concentration)

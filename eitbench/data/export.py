@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
+from eitbench import _check
 from eitbench._extras import require_extra
 from eitbench._files import PACKAGE, write_atomically
 from eitbench.data.cache import config_dict, world_digest
@@ -56,8 +57,7 @@ def export(examples: Dataset, folder: Path, format: str = "npz", *, n_jobs: int 
     n_jobs, backend
         Of the simulation; see `eitbench.data.presimulation.presimulate`.
     """
-    if format not in SUFFIXES:
-        raise ValueError(f"format must be one of {', '.join(SUFFIXES)}, got {format!r}")
+    _check.choice("format", format, SUFFIXES)
     if examples.basis is not None:
         raise ValueError("examples must have their truth on the nodes, got reduced coordinates")
     with require_extra(f"format {format}"):

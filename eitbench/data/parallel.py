@@ -16,6 +16,7 @@ from typing import Any, TypeVar
 
 from tqdm import tqdm
 
+from eitbench import _check
 from eitbench.worlds.registry import Entry, import_entries, runtime_entries
 
 BACKENDS = ("loky", "ray", "dask")
@@ -36,8 +37,7 @@ def run_parallel(function: Callable[..., Result], arguments: Sequence[tuple], n_
     ``n_jobs`` local processes, and repeat the task of a killed process. ``loky`` raises
     `WorkerLostError` then. ``ValueError`` for an unknown backend, or one that is not installed.
     """
-    if backend not in BACKENDS:
-        raise ValueError(f"backend must be one of {', '.join(BACKENDS)}, got {backend!r}")
+    _check.choice("backend", backend, BACKENDS)
     n_jobs = max(1, min(n_jobs, len(arguments)))
     try:
         run = {"loky": _with_joblib, "ray": _with_ray, "dask": _with_dask}[backend]

@@ -19,7 +19,7 @@ from eitbench.worlds.world import World
 KEY_DESCRIPTIONS = {
     "voltages": "measured electrode potentials relative to their mean, V, with noise",
     "currents": "injected currents, A (in 2D A per metre of depth), summing to zero",
-    "recent": "the last four of these, the latest first",
+    "recent": "the last four injections, the latest first",
     "frame": "voltages of the first frame; not in the scaled observation",
     "innovations": "measured minus predicted voltages, in predicted standard deviations",
     "mean": "estimate on {columns} × {rows} patches, x first, mol/m³",
@@ -32,9 +32,10 @@ KEY_DESCRIPTIONS = {
 }
 """Meaning of each entry of an observation."""
 
+WORLD_TEXT = "[T] marks numbers from the thesis, [E] choices of eitbench."
 RETURNS_TEXT = """
-Mean sum of rewards in the episodes dev:0–31 with the reduced filter, ± half its 95 % interval, of
-the best built-in policy of each group. `spec.reward_threshold` is the largest return without
+Mean sum of rewards in the episodes dev:0–31 with the reduced filter, ± half of its 95 % interval,
+of the best built-in policy of each group. `spec.reward_threshold` is the largest return without
 training. Made by `python studies/returns.py`.
 """
 
@@ -49,7 +50,7 @@ def describe_environment(id: str) -> str:
     parts = ["## Description", registered.description.strip(), _overview(env),
              sections[:observation].strip(), _observation_table(shown, env.world),
              sections[observation:].strip(), *_returns_table(id),
-             "## World", _world_table(registered.world)]
+             "## World", WORLD_TEXT, _world_table(registered.world)]
     return "\n\n".join(parts) + "\n"
 
 
@@ -58,8 +59,8 @@ def _returns_table(id: str) -> list[str]:
     rows = published_returns(id)
     if not rows:
         return []
-    lines = [f"| {row['group']} | `{row['policy']}` | {row['mean']} ± {row['half_width']} |"
-             for row in rows]
+    lines = [f"| {row['group']} | `{row['policy']}` | {float(row['mean']):.3f} ± "
+             f"{float(row['half_width']):.3f} |" for row in rows]
     return ["## Returns", RETURNS_TEXT.strip(),
             "\n".join(["| group | best policy | return |", "|---|---|---:|", *lines])]
 

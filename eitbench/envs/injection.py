@@ -53,7 +53,7 @@ class InjectionEnv(EpisodeEnv):
 
     | name | default | meaning |
     |---|---|---|
-    | `estimator` | "reduced" | reduced filter for training; "full": exact, for scores; "none" |
+    | `estimator` | "reduced" | reduced filter for training; "full" for scores; "none" |
     | `observation` | "scaled" | or "raw" |
     | `gate` | set by the id | the filter rejects innovations beyond this many standard deviations |
     | `inflow` | set by the id | inflow prior: "white" noise (Table 5.1), or "learned" |

@@ -1,4 +1,4 @@
-"""The core of every injection environment: B episodes at the same step."""
+"""Core of all injection environments: B episodes at the same step."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from gymnasium import spaces
 
+from eitbench import _check
 from eitbench.data.episode_cache import instrument_faults, integrals, score_mass, scoring_constants
 from eitbench.envs.episodes import EpisodeCore, Observation
 from eitbench.estimation.onboard.episode_filters import Innovation
@@ -20,9 +21,9 @@ if TYPE_CHECKING:
 
 OBSERVATION_FORMATS = ("scaled", "raw")
 MAX_SCALED = 5.0
-"""Largest entry of a scaled observation."""
+"""Largest absolute value of an entry of a scaled observation."""
 N_RECENT_CURRENTS = 4
-"""Injections in an observation."""
+"""Number of injections in the entry ``recent`` of an observation."""
 
 
 def flatten_scaled(rules: Rules, observation: Observation) -> np.ndarray:
@@ -30,8 +31,8 @@ def flatten_scaled(rules: Rules, observation: Observation) -> np.ndarray:
     and never beyond ±5.
 
     In this order: voltages, recent currents, innovations, mean and std on the grid, fault scores,
-    remaining steps and injections, and if the flow is estimated its velocity and standard
-    deviation; the first frame is omitted.
+    remaining steps and, with a budget, injections, and if the velocity is estimated, its mean and
+    standard deviation; the first frame is omitted.
     """
     world = rules.world
     level = world.expected_concentration
@@ -65,9 +66,7 @@ class InjectionCore(EpisodeCore):
 
     def __init__(self, rules: Rules, estimator: str, observation: str = "raw") -> None:
         super().__init__(rules.world)
-        if observation not in OBSERVATION_FORMATS:
-            raise ValueError(f"observation must be one of {', '.join(OBSERVATION_FORMATS)}, "
-                             f"got {observation!r}")
+        _check.choice("observation", observation, OBSERVATION_FORMATS)
         self.rules = rules
         self._filters_type = filters_class(rules, estimator)
         self._is_scaled = observation == "scaled" and self._filters_type is not None
@@ -114,7 +113,7 @@ class InjectionCore(EpisodeCore):
 
     def reset(self, seeds: Sequence[int],
               provide: Callable[[World, int], None] | None = None) -> None:
-        """Begin these episodes, up to the agent's first injection; see `EpisodeCore.reset`."""
+        """Begin these episodes; with a filter, measure the first frame. See `EpisodeCore.reset`."""
         world = self.world
         B = len(seeds)
         L = world.currents.shape[1]
@@ -122,7 +121,7 @@ class InjectionCore(EpisodeCore):
         self.t = self.n_initial
         """injections so far, including the first frame"""
         self.n_injections = np.zeros(B, dtype=int)
-        """(B,) injections that the agents have used of a budget"""
+        """(B,) used injections of the budget; 0 without a budget"""
         self._resistance = np.empty((T, B, L, L))
         self._draws = np.empty((T, B, L))
         self._deviations, self._squares, self._totals = np.empty((3, B, T))
@@ -165,7 +164,7 @@ class InjectionCore(EpisodeCore):
         self._homogeneous = None
 
     def homogeneous_errors(self) -> np.ndarray:
-        """(B, loaded steps) relative errors of the homogeneous estimates."""
+        """Return the relative errors (B, loaded steps) of the homogeneous estimates."""
         if self._homogeneous is None:
             level = self._filters.c_ref[:, None] - self.world.background
             area = score_mass(self.world).sum()
@@ -175,7 +174,7 @@ class InjectionCore(EpisodeCore):
         return self._homogeneous
 
     def _measure(self, k: int, currents: np.ndarray) -> np.ndarray:
-        """(B, L) voltages of injection t = k + 1."""
+        """Return the voltages (B, L) in V of injection t = k + 1."""
         return self.rules.instrument.measure(self.faults, k + 1, self._resistance[k], currents,
                                              self._draws[k])
 
@@ -205,8 +204,8 @@ class InjectionCore(EpisodeCore):
         return np.asarray(rewards)
 
     def errors(self) -> np.ndarray:
-        """(B,) relative errors (5.12) of the present estimates, NaN without an estimator or where
-        the state is not scored."""
+        """Return the relative errors (B,) (thesis 5.12) of the present estimates, NaN without an
+        estimator or where the state is not scored."""
         if self.t <= self.world.warm_up or not self._filters_type:
             return np.full(len(self.n_injections), np.nan)
         if self._errors is None:
@@ -216,8 +215,8 @@ class InjectionCore(EpisodeCore):
         return self._errors
 
     def estimate(self) -> tuple[np.ndarray, np.ndarray]:
-        """Present means and standard deviations (B, n) in mol/m³; without an estimator the expected
-        concentration and zero."""
+        """Return present means and standard deviations (B, n) in mol/m³; without an estimator the
+        expected concentration and zero."""
         if not self._filters_type:
             shape = (len(self.n_injections), scoring_constants(self.world).mass.shape[0])
             return np.full(shape, self.world.expected_concentration), np.zeros(shape)
@@ -228,25 +227,25 @@ class InjectionCore(EpisodeCore):
         return self.t, means[b], stds[b], self.currents[b]
 
     def innovations(self) -> list[Innovation | None]:
-        """Innovations of the measurements that the filters accepted last, by episode; for scores,
-        never for agents. None without an injection, an accepted measurement or an estimator."""
+        """Return each episode's innovation of the last accepted measurements, for scores, not for
+        agents; None without an injection, an accepted measurement or an estimator."""
         if not self._filters_type:
             return [None] * len(self.n_injections)
         return self._filters.innovations()
 
     def action_masks(self) -> np.ndarray:
-        """(B, actions) bool: numbered actions that have an effect; only the last one, without an
-        injection, when the budget is used up."""
+        """Return (B, actions) bool: actions that have an effect. When the budget is used up, only
+        the last one, which does not inject, has. ``ValueError`` if actions are currents."""
         if self._table is None:
-            raise ValueError("action_masks is for environments whose actions are numbers; here "
-                             "they are currents")
+            raise ValueError("action_masks requires actions that are numbers of pairs, got "
+                             "actions that are currents")
         masks = np.ones((len(self.n_injections), len(self._table)), dtype=bool)
         if self.rules.budget is not None:
             masks[self.n_injections >= self.rules.budget, :-1] = False
         return masks
 
     def observe(self) -> Observation:
-        """Return the last measurement and, with an estimator, its state on a grid; (B, …)."""
+        """Return raw observations (B, …): the last measurement and features of the estimate."""
         shown = {"voltages": self._voltages.copy(), "currents": self.currents.copy()}
         if self._filters_type:
             shown |= {"recent": self._recent.copy(), "frame": self._frames.copy()}

@@ -1,4 +1,4 @@
-"""Kalman filters: one recursion for all state spaces (thesis 5.1, docs/methods.md, 5)."""
+"""Kalman filters: one recursion for all state spaces (thesis 5.1, docs/methods.md, 7)."""
 
 from __future__ import annotations
 

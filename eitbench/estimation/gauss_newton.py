@@ -1,4 +1,4 @@
-"""Gauss–Newton, and reconstruction of a target at a fixed position (thesis 5.11)."""
+"""Gauss–Newton method, and reconstruction of a stationary target (thesis 5.11)."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ def gauss_newton(model: VoltageModel, voltages: np.ndarray, currents: np.ndarray
                  noise_std: np.ndarray, penalty: Any, start: np.ndarray, *,
                  tolerance: float = 1e-3, step_tolerance: float = 0.0,
                  max_iterations: int = 20) -> np.ndarray:
-    """Return argmin_c ‖(V − R(c))/std‖² + cᵀ penalty c, by Gauss–Newton with step halving.
+    """Return argmin_c ‖(V − U(c))/std‖² + cᵀ penalty c (n,), by Gauss–Newton with step halving.
 
-    (n,) in mol/m³; the best iterate if ``max_iterations`` run out or no step lowers the objective.
+    If ``max_iterations`` are reached or no step lowers the objective, it is the last iterate.
 
     Parameters
     ----------
@@ -35,13 +35,13 @@ def gauss_newton(model: VoltageModel, voltages: np.ndarray, currents: np.ndarray
         One frame: measurements in V, NaN where missing, injections in A (A/m in 2D), standard
         deviations in V.
     penalty : (n, n) sparse or dense
-        α² L_cᵀL_c; for the smoothness prior α² times the stiffness matrix, ∫|∇c|².
+        Inverse covariance of the prior, or α² times the stiffness matrix for α²∫|∇c|².
     start : (n,)
-        Initial guess in mol/m³.
+        Initial guess in the unit of c, mol/m³ or the unit of the model's argument.
     tolerance : float
-        Stop when a full step would lower the objective by a smaller relative amount.
+        A step with a smaller predicted relative decrease of the objective is the last one.
     step_tolerance : float
-        Stop when a full step would change all entries of c by less.
+        A step that changes all entries of c by less, in the unit of c, is the last one.
     """
     normal = _NormalEquations(penalty)
     missing = np.isnan(voltages)
@@ -131,11 +131,11 @@ def total_variation(model: VoltageModel, voltages: np.ndarray, currents: np.ndar
 
 
 class StationaryMap:
-    """Maximum a posteriori of a stationary target given all measurements so far, for
+    """Maximum a posteriori estimate of a stationary target from all measurements so far, for
     `FilterEstimator`.
 
-    A function u of the relative concentration c/ĉ_bh has the prior N(0, Γ_{0|0}) of the Kalman
-    filter. Each estimate starts from the one before.
+    A function u of the relative concentration c/ĉ_bh has the prior N(0, Γ_{0|0}), with the initial
+    covariance of the Kalman filter. Gauss–Newton starts from the previous estimate.
 
     Parameters
     ----------
@@ -156,11 +156,11 @@ class StationaryMap:
         self._record: list[tuple[np.ndarray, np.ndarray]] = []
 
     def assimilate(self, voltages: np.ndarray, currents: np.ndarray) -> None:
-        """Store a measurement vector."""
+        """Store a measurement vector (L,) in V and its injection (L,) in A (A/m in 2D)."""
         self._record.append((voltages, currents))
 
     def estimate(self, lag: int = 0) -> Estimate:
-        """Return the reconstruction."""
+        """Return the estimate (n,) in mol/m³ from all measurements so far; ``lag`` is ignored."""
         V, I = (np.array(part) for part in zip(*self._record, strict=True))
         self._u = gauss_newton(self, V, I, self.task.noise.std(V), self._penalty, self._u)
         return Estimate(self.c_ref * self.relative(self._u)[0])
@@ -170,7 +170,7 @@ class StationaryMap:
         return self.task.observation.voltages(self.c_ref * self.relative(u)[0], currents)
 
     def linearise(self, u: np.ndarray, currents: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return voltages (K, L) in V, and their derivatives (K, L, n) by u."""
+        """Return voltages (K, L) in V, and their derivatives (K, L, n) by u in V."""
         relative, derivative = self.relative(u)
         voltages, by_c = self.task.observation.linearise(self.c_ref * relative, currents)
         return voltages, by_c * (self.c_ref * derivative)

@@ -1,4 +1,4 @@
-"""Innovation, gate and conditioning: the update of every filter (docs/methods.md, 5)."""
+"""Innovation, gate and conditioning: the update of every filter (docs/methods.md, 7)."""
 
 from __future__ import annotations
 

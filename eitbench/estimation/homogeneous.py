@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 def best_homogeneous(model: VoltageModel, noise: VoltageNoise, n: int, voltages: np.ndarray,
                      currents: np.ndarray, start: float, *, tolerance: float = 1e-8,
                      max_iterations: int = 30) -> float:
-    """Return ĉ_bh = argmin_c Σ ((V − R(c·1))/std)², by Gauss–Newton in ln c (docs/methods.md, 3).
+    """Return ĉ_bh = argmin_c Σ ((V − U(c·1))/std)², by Gauss–Newton in ln c (docs/methods.md, 3).
 
     Steps in ln c keep c positive. ``RuntimeError`` if the iteration does not converge.
 
@@ -29,7 +29,7 @@ def best_homogeneous(model: VoltageModel, noise: VoltageNoise, n: int, voltages:
     start : float
         Initial guess in mol/m³, > 0.
     """
-    # Injections repeat: R(c·1) is computed once for each distinct pattern.
+    # Injections repeat: U(c·1) is computed once for each distinct pattern.
     patterns, which = np.unique(currents, axis=0, return_inverse=True)
     which = which.reshape(-1)
     weight = np.isfinite(voltages) / noise.std(np.nan_to_num(voltages))

@@ -36,7 +36,7 @@ PROBE_WIDTH_M = 0.02
 
 @dataclass(frozen=True, eq=False)
 class IdentifiedModel:
-    """Model c_t = ĉ_bh (1 + B (Σ_k W_k s_{t−k} + e_t)), s = c_in/ĉ_bh − 1, V = R(c) + std·b + v.
+    """Model c_t = ĉ_bh (1 + B (Σ_k W_k s_{t−k} + e_t)), s = c_in/ĉ_bh − 1, V = U(c) + std·b + v.
 
     e_t ~ N(0, Γ_e) is modelled as white. The mean voltage error b and the identified response W
     absorb systematic model error; Γ_e is the covariance of the remainder (Kaipio & Somersalo 2007).
@@ -92,7 +92,7 @@ class IdentifiedModel:
         return root
 
     def mean_error(self, currents: np.ndarray, std: np.ndarray) -> np.ndarray:
-        """Return the mean of V − R(c) (L,) in V for an injection (L,), with noise ``std`` (L,) in
+        """Return the mean of V − U(c) (L,) in V for an injection (L,), with noise ``std`` (L,) in
         V; zero if the training episodes do not contain the injection."""
         number = self._number(currents)
         return np.zeros_like(std) if number is None else self.mean_voltage_error[number] * std

@@ -54,7 +54,7 @@ def maximise_posterior(smoother: Filter, task: Task, record: Sequence[Measuremen
     """Move the mean of `full_window_filter` to the maximum of the posterior density, and set the
     covariance to the Laplace approximation there.
 
-    With x = L z, z ~ N(0, I), it minimises ‖z‖² + Σ_t ‖A_t (V_t − R(c_t(x)))‖² by Gauss–Newton with
+    With x = L z, z ~ N(0, I), it minimises ‖z‖² + Σ_t ‖A_t (V_t − U(c_t(x)))‖² by Gauss–Newton with
     step halving. A_t whitens the voltage errors, which follow from the smoothed states.
     """
     voltages = _WhitenedVoltages(smoother, task, record)

@@ -85,8 +85,7 @@ class InflowPrior:
     """for filters that switch between slug and quiet; None: not estimated"""
 
     def __post_init__(self) -> None:
-        if self.link not in LINK_NAMES:
-            raise ValueError(f"link must be one of {', '.join(LINK_NAMES)}, got {self.link!r}")
+        _check.choice("link", self.link, LINK_NAMES)
         _check.number("time_step", self.time_step, low=0.0, open_low=True, units="s")
         points = _check.array("points", self.points, (None, None), units="m")
         modes = _check.array("modes", self.modes, (len(points), None))

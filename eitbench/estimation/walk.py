@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from eitbench.physics.transport import EvolutionModel
 
 MODE_VARIANCE_CUTOFF = 1e-3
-"""Modes with a smaller variance, relative to the first mode, are dropped."""
+"""Modes with a smaller variance, relative to the largest, are dropped."""
 
 
 def matern32_transition(phase: float) -> tuple[np.ndarray, np.ndarray]:
@@ -44,23 +44,23 @@ class RandomWalk:
     """`Transport` with c⁺ = φ c + (1 − φ) c̄ + e, where c̄ is the mean over the vessel and e a
     Matérn field of correlation ``length``.
 
-    With φ < 1 past states decay, and the variance has the limit std(e)²/(1 − φ²).
+    With φ < 1 the variance of c − c̄ has the limit var(e − ē)/(1 − φ²); c̄ is a random walk.
     """
 
     mesh: Mesh
     """mesh of the concentration"""
     time_step: float
-    """s between two measurement vectors"""
+    """time between two measurement vectors in s"""
     length: float
     """ℓ in m, > 0, correlation length of the changes; see `smoothness_covariance`"""
     ar_coefficient: float = 1.0
     """φ, from 0 to 1"""
     matern_rate: float = 0.0
-    """λ in 1/s of a Matérn 3/2 process with the same likelihood; 0: unknown"""
+    """λ in 1/s of a Matérn 3/2 process that may replace the walk (`log_steady_filter`); 0: none"""
 
     @property
     def inlet(self) -> np.ndarray:
-        """Empty array of nodes."""
+        """Empty array: a walk has no inlet nodes."""
         return np.empty(0, dtype=np.int64)
 
     def step(self, c: np.ndarray, inflow_before: np.ndarray | float = 0.0,

@@ -100,8 +100,7 @@ def calibrate(electrodes: CompleteElectrodeModel, currents: np.ndarray, matrix: 
     noise : VoltageNoise, optional
         Default: fitted to the variance between frames, or to the misfit of a single frame.
     """
-    if correction not in CORRECTIONS:
-        raise ValueError(f"correction must be one of {', '.join(CORRECTIONS)}, got {correction!r}")
+    _check.choice("correction", correction, CORRECTIONS)
     L = electrodes.n_electrodes
     currents = _check.array("currents", currents, (None, L), units="A")
     matrix = _check.array("matrix", matrix, (None, L))

@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from eitbench._check import did_you_mean
+from eitbench import _check
 from eitbench.measured.measurements import Measurements
 from eitbench.measured.readers import load_yaml, read
 from eitbench.measured.segmentation import read_truth
@@ -147,9 +147,7 @@ def read_case(name: Path | str) -> MeasuredCase:
     path = Path(name)
     if path.suffix != ".yml":
         names = {each.stem: each for each in sorted(CASES.glob("*.yml"))}
-        if str(name) not in names:
-            raise ValueError(f"case must be one of {', '.join(names)}, or a YAML file, got "
-                             f"{name}{did_you_mean(name, names)}")
+        _check.choice("case, if not a YAML file,", str(name), names)
         path = names[str(name)]
     entries = load_yaml(path, "case")
     if missing := [each for each in (*_TEXTS, "vessel") if each not in entries]:

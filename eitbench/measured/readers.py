@@ -45,8 +45,7 @@ def read(path: Path | str, format: str | None = None, steps: slice | None = None
     if not path.exists():
         raise ValueError(f"{path} must be a file or a folder, got a missing path")
     format = format or _detect_format(path)
-    if format not in READERS:
-        raise ValueError(f"format must be one of {', '.join(READERS)}, got {format!r}")
+    _check.choice("format", format, READERS)
     if format == "table" and "electrodes" not in options:
         options = _table_options(path) | options
     names = set(signature(READERS[format]).parameters) - {"path", "steps"}
@@ -84,8 +83,8 @@ def read_sciospec(path: Path, *, frequency: float | None = None) -> Measurements
     The voltages are the real parts of the potentials relative to the mean of all electrodes, or of
     the differences of neighbouring channels, by the header's measurement mode. The current enters
     at the first electrode of a pair with the header's amplitude in A. The injections of a frame
-    are evenly spaced until the next frame. A file of several frequencies needs ``frequency`` in Hz
-    to select one.
+    are evenly spaced until the next frame. A file of several frequencies requires ``frequency``,
+    its lowest or highest one, in Hz.
     """
     files = sorted(path.glob("*.eit")) if path.is_dir() else [path]
     if not files:
@@ -116,9 +115,9 @@ def read_sciospec(path: Path, *, frequency: float | None = None) -> Measurements
 
 
 def _relative_to_mean(potentials: np.ndarray, index: np.ndarray) -> np.ndarray:
-    """Return potentials (T, L) relative to the mean of all electrodes, for injections ``index``. A
-    missing potential, or a spike, enters the mean with its median over the uses of the injection,
-    if there is one."""
+    """Return potentials (T, L) relative to the mean of all electrodes, for injections ``index``. In
+    the mean, a missing potential or a spike is replaced by the median of this channel over the
+    repetitions of the injection, if there is one."""
     with warnings.catch_warnings(action="ignore", category=RuntimeWarning):     # rows of NaN
         potentials = potentials - np.nanmedian(potentials, axis=1, keepdims=True)
         known = np.where(find_spikes(potentials, index), np.nan, potentials)
@@ -205,15 +204,15 @@ def read_table(path: Path, *, electrodes: int, current: float, time_step: float 
         V per unit of the table; 1e-3 for mV.
     decimal : "." or ","
     separator : str, optional
-        Default: a tab, a semicolon, or else a comma.
+        Default: a tab or a semicolon if the first line contains one, else a comma.
     reference_rows : int
         Number of first rows that become the reference: complete frames of homogeneous fluid.
     readings : "potentials" or "neighbours", optional
-        A voltage is the potential of its electrode, or its difference from the next electrode.
-        Default: differences if all their titles are such as ``U1-U2``.
+        Voltage l is the potential U_l of electrode l, or the difference U_l − U_(l+1).
+        Default: differences if all titles are such as ``U1-U2``, else potentials.
     """
-    if readings not in (None, *TABLE_VOLTAGES):
-        raise ValueError(f"readings must be one of {', '.join(TABLE_VOLTAGES)}, got {readings!r}")
+    if readings is not None:
+        _check.choice("readings", readings, TABLE_VOLTAGES)
     L = _check.integer("electrodes", electrodes, low=2)
     _check.number("current", current, low=0.0, open_low=True, units="A")
     _check.number("time_step", time_step, low=0.0, open_low=True, units="s")
@@ -287,7 +286,7 @@ def _is_number(text: str, decimal: str) -> bool:
 
 
 def _table_options(table: Path) -> dict[str, Any]:
-    """Load the description ``TABLE.csv.yml`` or ``TABLE.yml``; the latter may be a vessel's."""
+    """Load ``TABLE.csv.yml`` or ``TABLE.yml``; a file with ``kind`` describes a vessel instead."""
     path = next((each for each in (table.with_name(table.name + ".yml"), table.with_suffix(".yml"))
                  if each.is_file() and "kind" not in load_yaml(each, "table")), None)
     if path is None:

@@ -15,7 +15,7 @@ from eitbench import _check
 from eitbench.measured.readers import load_yaml
 from eitbench.numerics.mesh import Mesh
 from eitbench.physics.cem import CompleteElectrodeModel
-from eitbench.worlds.vessels import MeshVessel, PlanePipe, RoundPipe, RoundTank
+from eitbench.worlds.vessels import MAX_COVERAGE, MeshVessel, PlanePipe, RoundPipe, RoundTank
 
 NUMBERING_DIRECTIONS = ("counter-clockwise", "clockwise")
 INITIAL_CONTACT_IMPEDANCE = 1e-4
@@ -78,9 +78,7 @@ class VesselConfig:
     def __post_init__(self) -> None:
         _check.number("first", self.first_electrode_deg, units="degrees")
         _check.number("depth", self.depth, low=0.0, open_low=True, units="m")
-        if self.direction not in NUMBERING_DIRECTIONS:
-            raise ValueError(f"direction must be one of {', '.join(NUMBERING_DIRECTIONS)}, "
-                             f"got {self.direction!r}")
+        _check.choice("direction", self.direction, NUMBERING_DIRECTIONS)
         if self.conductivity is not None:
             _check.number("conductivity", self.conductivity, low=0.0, open_low=True, units="S/m")
         if self.flow and self.flow.is_estimated and not isinstance(self.shape, PlanePipe):
@@ -141,8 +139,7 @@ def read_vessel(source: Path | str | Mapping[str, Any]) -> VesselConfig:
     else:
         entries, folder = load_yaml(Path(source), "vessel"), Path(source).parent
     kind = entries.pop("kind", None)
-    if kind not in VESSEL_ENTRIES:
-        raise ValueError(f"vessel.kind must be one of {', '.join(VESSEL_ENTRIES)}, got {kind!r}")
+    _check.choice("vessel.kind", kind, VESSEL_ENTRIES)
     required, optional = VESSEL_ENTRIES[kind]
     if missing := sorted(required - set(entries)):
         raise ValueError(f"vessel of kind {kind} must have {', '.join(missing)}")
@@ -192,5 +189,7 @@ def _cover(entries: Mapping[str, Any], width: str, density: float) -> float:
         raise ValueError(f"vessel must have either {width} or cover, got "
                          f"{'both' if width in entries else 'neither'}")
     if "cover" in entries:
-        return _check.number("vessel.cover", entries["cover"])
-    return density * _check.number(f"vessel.{width}", entries[width], units="m")
+        return _check.number("vessel.cover", entries["cover"], low=0.0, high=MAX_COVERAGE,
+                             open_low=True)
+    return density * _check.number(f"vessel.{width}", entries[width], low=0.0, open_low=True,
+                                   high=MAX_COVERAGE / density, units="m")

@@ -81,7 +81,7 @@ class VoltageModel(Protocol):
 
 
 class ObservationModel:
-    """Model of the voltages V = R(c) for a nodal concentration on the transport mesh.
+    """Model of the voltages V = U(c) for a nodal concentration on the transport mesh.
 
     The concentration is interpolated linearly to the non-conforming EIT mesh and converted to a
     conductivity. Values below ``min_concentration`` are replaced by it, with the slope of the law

@@ -18,14 +18,7 @@ from eitbench.bench.methods import Method
 from eitbench.bench.run import Job
 from eitbench.bench.tracks import Environment, subtrack_of
 from eitbench.data.episode_cache import truth_mesh
-from eitbench.envs.rendering import (
-    FIELD_COLORMAP,
-    IDLE,
-    SINK,
-    SOURCE,
-    STD_COLORMAP,
-    draw_comparison,
-)
+from eitbench.envs import rendering
 from eitbench.report.plot import parse_single_seed, run_until, states_at
 
 ANIMATION_SUFFIXES = (".gif", ".webp")
@@ -92,15 +85,16 @@ def _compared_frames(env: Any, loaded: list[Method], seed: int, at: range) -> It
         truth, _, currents = shown[0][1][t]
         fields = [("Truth", truth_mesh(env.world), truth)]
         fields += [(title, env.task.mesh, states[t][1]) for title, states in shown]
-        yield draw_comparison(env.task, fields, currents, t * env.task.transport.time_step)
+        time = t * env.task.transport.time_step
+        yield rendering.draw_comparison(env.task, fields, currents, time)
 
 
 def _palette() -> Image.Image:
     """Return the 256 colours shared by all frames: colour maps, greys, electrodes."""
     colours = [colormaps[name](np.linspace(0, 1, n))[:, :3]
-               for name, n in ((FIELD_COLORMAP, 120), (STD_COLORMAP, 100))]
+               for name, n in ((rendering.FIELD_COLORMAP, 120), (rendering.STD_COLORMAP, 100))]
     greys = np.linspace(0, 1, 27)[:, None].repeat(3, axis=1)
-    pairs = [to_rgb(colour) for colour in (SOURCE, SINK, IDLE)]
+    pairs = [to_rgb(colour) for colour in (rendering.SOURCE, rendering.SINK, rendering.IDLE)]
     halves = [tuple(0.5 + 0.5 * c for c in colour) for colour in pairs]  # at the edges of the bars
     table = np.concatenate([*colours, greys, pairs, halves, halves])[:256]
     image = Image.new("P", (1, 1))

@@ -21,7 +21,6 @@ from eitbench.bench import tracks
 from eitbench.bench.episode_table import read_episode_table, table_path
 from eitbench.bench.ranking import agent_name, mean_by_seed, shared_ranks
 from eitbench.bench.records import (
-    BOARDS,
     finished_at,
     read_valid_files,
     record_file_name,
@@ -213,7 +212,7 @@ def leaderboard_table(found: Iterable[Leaderboard]) -> pd.DataFrame:
 
 
 def record_category(record: dict[str, Any]) -> str:
-    """Return the class in `CATEGORIES` of a record."""
+    """Return the category of a record, one of `CATEGORIES`."""
     return tracks.category_of(record["environment"]["id"], record["board"])
 
 
@@ -473,7 +472,7 @@ def anchors(records: Iterable[dict[str, Any]]) -> Anchors:
         if record["method"] in SKILL_ANCHORS and version_number(record.get("version", "v1")):
             key = (record["method"], world_key(record), record["split"])
             found[key] = max(found.get(key, record), record, key=lambda other: (
-                other["official"], BOARDS.index(other["board"]), finished_at(other)))
+                other["official"], tracks.ALL_SUBTRACKS.index(other["board"]), finished_at(other)))
     return {key: scores_by_seed(record, "error") for key, record in found.items()}
 
 

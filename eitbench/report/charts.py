@@ -64,8 +64,9 @@ class Axis:
     """Map from values to px, logarithmic or linear, with ticks at round numbers."""
 
     def __init__(self, low: float, high: float, begin: float, end: float, *, log: bool) -> None:
-        wide = high - low > 1e-12 * max(abs(low), abs(high))
-        self.low, self.high = low, high if wide else low + max(1.0, abs(low))
+        if high - low <= 1e-12 * max(abs(low), abs(high)):                 # a single value
+            low, high = (low / 2, low * 2) if log else (low, low + max(1.0, abs(low)))
+        self.low, self.high = low, high
         self.begin, self.end, self.log = begin, end, log
 
     def __call__(self, value: float) -> float:

@@ -1,4 +1,4 @@
-"""Paired comparison of two methods: differences, intervals, fraction of episodes won."""
+"""Paired comparison of two methods: differences, probabilities of improvement, intervals."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from eitbench.bench.statistics import (
 )
 from eitbench.bench.table import MISSING, Cell, Table, number_cell
 from eitbench.bench.text import format_interval, scores_by_seed
-from eitbench.bench.tracks import CATEGORIES, qualified_name
+from eitbench.bench.tracks import CATEGORIES, nominal_id, qualified_name
 from eitbench.report.boards import is_naive_baseline, record_category, skill_scores
 
 COMPARISON_FIELDS = ("environment", "score", "episodes", "a", "b", "advantage", "low", "high",
@@ -38,20 +38,23 @@ SKILL_SCORE = "skill score"
 """Score over several environments instead of the error, whose mean the largest error dominates."""
 BUNDLED_RECORDS = bundled_path("leaderboards") / "results"
 """Records of the package."""
+OWN_RECORDS = Path("results/records")
+"""Records of `eitbench run`."""
 MIN_VERSION_PREFIX = 4
 """Smallest number of leading sha256 digits that identify a version."""
 
 
 def find_records(name: str, folder: Path) -> list[dict[str, Any]]:
-    """Return the records of a method from the path of one, or from METHOD or METHOD@VERSION within
-    a folder, otherwise among the bundled records. Without a version the newest, official ones
-    where there are any; a third-party version may be shortened to four digits. The name of an agent
-    without its training seed, such as ppo, is the mean over its trainings.
+    """Return the record in the file NAME.json, or the records METHOD or METHOD@VERSION of the
+    first of these that has any: a folder, the package, `OWN_RECORDS`. Without a version the current
+    official records are returned, or else the other current ones. A third-party version may be
+    shortened to four digits. The name of an agent without training seed, such as ppo, selects its
+    `mean_over_trainings`.
 
     Raises
     ------
     ValueError
-        If no record matches, or a name without version fits several versions.
+        If no record matches, or records of several versions match.
     """
     if name.endswith(".json"):
         return [read_record(resolve_input(Path(name)))]
@@ -62,7 +65,7 @@ def find_records(name: str, folder: Path) -> list[dict[str, Any]]:
         return own == version or (shortened and own.startswith(version))
 
     known: set[str] = set()
-    for place in dict.fromkeys([folder.resolve(), BUNDLED_RECORDS.resolve()]):
+    for place in dict.fromkeys(map(Path.resolve, (folder, BUNDLED_RECORDS, OWN_RECORDS))):
         there = read_records(place)
         known |= {record["method"] for record in there}
         if not version:
@@ -78,12 +81,13 @@ def find_records(name: str, folder: Path) -> list[dict[str, Any]]:
             raise ValueError(f"{name} fits several versions: {found}")
         if own:
             return own
-    raise ValueError(f"record of {name} not found in {folder}" + _check.did_you_mean(method, known))
+    raise ValueError(f"record of {name} not found in {folder}, the package, or {OWN_RECORDS}"
+                     + ("" if method in known else _check.did_you_mean(method, known)))
 
 
 def mean_over_trainings(records: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Return a record of each environment and split with the mean of each score over the trainings
-    of an agent, in the episodes that all of them finished."""
+    """Return a record for each environment and split, with the mean of each score over the training
+    seeds of an agent, in the episodes that all of them finished."""
     groups: dict[tuple[str, str], list[dict[str, Any]]] = {}
     for record in records:
         groups.setdefault(_environment_and_split(record), []).append(record)
@@ -101,16 +105,14 @@ def mean_over_trainings(records: list[dict[str, Any]]) -> list[dict[str, Any]]:
 
 
 def resolve_score(name: str) -> Score:
-    """Return the score of this name; ``ValueError`` if none has a better direction."""
+    """Return the score of this name; ``ValueError`` if it is unknown or has no better direction."""
     known = {each.name: each for each in scores().values() if each.direction in ("lower", "higher")}
-    if name not in known:
-        raise ValueError(f"score must be one of {', '.join(known)}; got {name!r}"
-                         + _check.did_you_mean(name, known))
+    _check.choice("score", name, known)
     return known[name]
 
 
 def naive_baseline_records(folder: Path) -> list[dict[str, Any]]:
-    """Return the records of naive baselines: bundled ones, and from a folder, which precede."""
+    """Return the current records of naive baselines, of the package and then of a folder."""
     folders = dict.fromkeys([BUNDLED_RECORDS.resolve(), folder.resolve()])
     return split_outdated([record for each in folders for record in read_records(each)
                    if is_naive_baseline(record)])[0]
@@ -122,8 +124,8 @@ def compare(a: list[dict[str, Any]], b: list[dict[str, Any]], score: str = "erro
     and rows for several of them together.
 
     For the error, the aggregate rows compare skill scores: ``all filter`` and so on, for each
-    category with several environments that have a baseline among ``zero``. For other scores there
-    is one row, ``all``.
+    category with several environments, shifted ones excluded, that have a naive baseline in the
+    records ``zero``. For other scores there is one row, ``all``.
 
     Returns
     -------
@@ -154,15 +156,18 @@ def compare(a: list[dict[str, Any]], b: list[dict[str, Any]], score: str = "erro
             own, other = ({seed: each[seed] for seed in shared} for each in pair)
             both[label] = own, other
             level = levels.get(place, {})
-            if gained := skill_scores(level, own):
+            if (gained := skill_scores(level, own)) and not nominal_id(record["environment"]["id"]):
                 gains[record_category(record)][label] = gained, skill_scores(level, other)
     if not both:
-        also = f" with {score}" if score != "error" else ""
-        raise ValueError(f"methods must share an environment and a seed that both finished{also}")
+        finished = (f"{len(scores_by_seed(record, score))} episodes of {record['method']} in "
+                    f"{qualified_name(record['environment'])}" for record in (*a, *b))
+        raise ValueError(f"methods must share an environment and a seed that both finished with "
+                         f"{score}; there are {', '.join(finished)}")
     rows = [_row(label, score, {label: pair}, mean_over_environments, higher=higher)
             for label, pair in both.items()]
     if score == "error":
-        rows += [_row(f"all {kind}", SKILL_SCORE, together, interquartile_mean, higher=True)
+        rows += [_row(f"all {kind} ({len(together)} environments)", SKILL_SCORE, together,
+                      interquartile_mean, higher=True)
                  for kind, together in gains.items() if len(together) > 1]
     elif len(both) > 1:
         rows.append(_row("all", score, both, mean_over_environments, higher=higher))
@@ -192,8 +197,8 @@ def display_names(a: dict[str, Any], b: dict[str, Any]) -> tuple[str, str]:
 
 
 def comparison_table(table: pd.DataFrame, a: str, b: str, score: str = "error") -> Table:
-    """Return the comparison of methods named ``a`` and ``b``, with the better one where the
-    95 % interval of the advantage of a excludes zero."""
+    """Return the comparison of methods named ``a`` and ``b``; column better has the name of the
+    better one where the 95 % interval of the advantage of a excludes zero."""
     asked = resolve_score(score)
     rows = []
     for row in table.to_dict("records"):
@@ -219,8 +224,7 @@ def comparison_table(table: pd.DataFrame, a: str, b: str, score: str = "error") 
 def format_comparison(table: pd.DataFrame, a: str, b: str, score: str, width: int) -> str:
     """Return the comparison in lines of ``width`` characters, where the methods are A and B."""
     whole = comparison_table(table, "A", "B", score)
-    first = ("environment", "better", "advantage of A", *whole.headings[3:5], "A better",
-             "episodes")
+    first = ("environment", "better", "advantage of A", "A better", *whole.headings[3:5])
     fitted = whole.fit_width(width, first)
     return "\n\n".join([f"A: {a}\nB: {b}", fitted.markdown(),
                         *filter(None, [whole.omitted_columns(fitted)])])

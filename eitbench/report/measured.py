@@ -40,6 +40,8 @@ MIN_PLOTTED = 1e-2
 LOG_SCALE_RATIO = 5.0
 """Ratio of the largest to the smallest estimate from which on colours are logarithmic."""
 COLOUR_QUANTILES = (0.005, 0.995)
+MIN_COLOUR_RANGE = 0.02
+"""Smallest range of the colours relative to the mean conductivity; noise would fill a smaller."""
 
 
 def write_report(path: Path, env: MeasuredEnv, runs: Sequence[MeasuredRun],
@@ -55,10 +57,10 @@ def write_report(path: Path, env: MeasuredEnv, runs: Sequence[MeasuredRun],
                   run.mean_nis(env.task.warm_up)) for run in runs],
         warnings=env.quality_warnings(),
         facts=_facts(env), estimate=_estimate(env, runs[0]), first=runs[0].method,
-        over_time=_figure(_over_time(env, runs)), velocity=_velocity(env, runs),
+        over_time=_over_time(env, runs), velocity=_velocity(env, runs),
         fit=_figure(_fit(env)), correction=CORRECTION_TEXT[calibration.correction],
         contacts=_figure(_contacts(env)), electrodes=_figure(_electrodes(runs[0])),
-        at_rest=_is_at_rest(env),
+        at_rest=_is_at_rest(env), is_scored=env.withheld > 0.0,
         segmentation="" if truth is None else _figure(_segmentations(env, runs, truth)))
     write_atomically(path, page)
 
@@ -114,6 +116,8 @@ def _picture(env: MeasuredEnv, run: MeasuredRun, row: int) -> Figure:
     scale = 1e3 * env.calibration.conductivity / task.expected_concentration
     shown = scale * run.mean[run.steps > min(task.warm_up, env.episode_steps - 1)]
     low, high = np.quantile(shown, COLOUR_QUANTILES)
+    wider = max(0.5 * (MIN_COLOUR_RANGE * abs(low + high) / 2 - (high - low)), 0.0)
+    low, high = low - wider, high + wider
     field = scale * run.mean[row]
     in_decades = shown.min() > 0.0 and high > LOG_SCALE_RATIO * low
     if in_decades:
@@ -152,21 +156,23 @@ def _segmentations(env: MeasuredEnv, runs: Sequence[MeasuredRun], truth: np.ndar
     return figure
 
 
-def _over_time(env: MeasuredEnv, runs: Sequence[MeasuredRun]) -> Figure:
-    """Withheld residuals and NIS of each method."""
-    figure, (residual, nis) = _panels(2, (10.5, 3.4))
+def _over_time(env: MeasuredEnv, runs: Sequence[MeasuredRun]) -> str:
+    """Withheld residuals and NIS of each method, if there are any, as a data URI; else empty."""
     frame = max(env.task.warm_up, 1)
-    _plot(residual, env, {run.method: np.sqrt(_frame_means(run.withheld_residual_rms**2, frame))
-                          for run in runs}, "withheld residual / noise std")
-    _plot(nis, env, {run.method: _frame_means(run.nis, frame) for run in runs}, "NIS/m")
-    for ax in (residual, nis):
+    curves = {"withheld residual / noise std": {
+        run.method: np.sqrt(_frame_means(run.withheld_residual_rms**2, frame)) for run in runs},
+        "NIS/m": {run.method: _frame_means(run.nis, frame) for run in runs}}
+    shown = [(label, own) for label, own in curves.items() if np.isfinite([*own.values()]).any()]
+    if not shown:
+        return ""
+    figure, axes = _panels(len(shown), (10.5, 3.4))
+    for ax, (label, own) in zip(axes, shown, strict=True):
+        _plot(ax, env, own, label)
         ax.axhline(1.0, color="0.7", linewidth=1)
         ax.set_yscale("log")
         ax.set_ylim(bottom=max(ax.get_ylim()[0], MIN_PLOTTED))
-    if not any(np.isfinite(run.nis).any() for run in runs):
-        nis.set_axis_off()
-    residual.legend(frameon=False, fontsize=9)
-    return figure
+    axes[0].legend(frameon=False, fontsize=9)
+    return _figure(figure)
 
 
 def _velocity(env: MeasuredEnv, runs: Sequence[MeasuredRun]) -> str:
@@ -234,7 +240,8 @@ def _electrodes(run: MeasuredRun) -> Figure:
     figure, (axes,) = _panels(1, (10.5, 1.6 + 0.09 * len(number)))
     if len(residuals) == 1:
         axes.bar(number, residuals[0], color=LINE_COLOURS[1])
-        axes.set(xlabel="electrode", ylabel="residual of its measurements / noise std")
+        axes.set(xlabel="electrode", ylabel="residual / noise std",
+                 ylim=(0.0, max(1.0, 1.05 * float(np.nanmax(residuals)))))
         return figure
     shown = np.log10(np.maximum(residuals.T, 1e-3))
     drawn = axes.pcolormesh(run.frame_times, number, shown, cmap="magma", shading="nearest",

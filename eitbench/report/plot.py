@@ -142,10 +142,7 @@ def compare(table: pd.DataFrame | Iterable[pd.DataFrame], ax: Axes | None = None
         raise ValueError("table must be a DataFrame or several, as eitbench.evaluate returns them, "
                          f"got {kinds or 'none'}")
     rows = pd.concat(tables)
-    if score not in rows or score in ("environment", "method", "seed"):
-        known = [name for name in rows if name in scores()]
-        raise ValueError(f"score must be one of {', '.join(known)}; got {score!r}"
-                         + _check.did_you_mean(score, known))
+    _check.choice("score", score, [name for name in rows if name in scores()])
     several = rows["environment"].nunique() > 1
     names = rows["method"] + (", " + rows["environment"] if several else "")
     values = {str(name): own.dropna().astype(float).to_numpy()

@@ -119,7 +119,7 @@ class ScoreAxes(NamedTuple):
         each = sorted(part.cells[name] for part in parts if part.is_ranked)
         if each:
             spread = format_interval(value, each[0], each[-1]).partition(" ")[2].strip("()")
-            interval += f" each {spread or format_number(value)}"
+            interval += f"; seeds {spread or format_number(value)}"
         drawn = charts.sparkline((value, low, high), self.axes[name], mark=self.marks[name],
                                  each=each)
         return Cell(text, value, drawn, note=interval.strip())
@@ -358,7 +358,7 @@ def curve_chart(board: Leaderboard) -> charts.Chart | None:
     series = [charts.Series(row.cells["title"], row.colour, errors, faint=row not in strong)
               for row, errors in found]
     steps = np.arange(1, max(len(each.values) for each in series) + 1)
-    svg = charts.line_chart(steps, series, "scored state", "relative error")
+    svg = charts.line_chart(steps, series, "scored state", "relative squared error")
     return charts.Chart(svg, charts.legend(each for each in series if not each.faint),
                         " Thin lines: all other methods." if len(strong) < len(found) else "")
 

@@ -169,7 +169,10 @@ def load_agent(path: Path, content: bytes) -> tuple[str, str, type[AgentPolicy],
                          f"{found}")
     from eitbench.rl.training import ALGORITHMS
     algo, seed = asked["algo"], asked["seed"]
-    model = ALGORITHMS[algo].load(io.BytesIO(content), device="cpu")
+    try:
+        model = ALGORITHMS[algo].load(io.BytesIO(content), device="cpu")
+    except Exception as error:
+        raise ValueError(f"policy {path} must be a model of the algorithm {algo}") from error
     policy = type("Policy", (_ModelPolicy,), {
         "model": model, "uses_action_masks": algo.startswith("maskable"),
         "estimator": asked.get("kwargs", {}).get("estimator", "reduced")})

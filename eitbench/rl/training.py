@@ -50,7 +50,7 @@ from eitbench.envs.injection import InjectionEnv, InjectionVectorEnv
 from eitbench.rl.imitation import check_imitation, imitate, load_compatible_policy, rollout
 from eitbench.rl.networks import MaskablePairPolicy, PairPolicy
 from eitbench.rl.vec_env import InjectionVecEnv
-from eitbench.worlds.registry import entries, entry
+from eitbench.worlds.registry import entries
 
 ALGORITHMS: dict[str, type[BaseAlgorithm]] = {
     "ppo": PPO, "dqn": DQN, "sac": SAC, "recurrent_ppo": RecurrentPPO,
@@ -158,17 +158,18 @@ def train(env: str, algo: str, config: TrainingConfig, seed: int, folder: Path,
     kwargs : dict, optional
         Arguments of the environment.
     """
-    if algo not in ALGORITHMS:
-        raise ValueError(f"algo must be one of {', '.join(ALGORITHMS)}, got {algo!r}")
+    _check.choice("algo", algo, ALGORITHMS)
     seed = _check.integer("seed", seed, low=0)
     envs = vector_env(env, kwargs, config)
     asked = {"env": env, "kwargs": kwargs or {}, "algo": algo, "seed": seed,
              "config": asdict(config)}
     settings, made, latest = (folder / name for name in ("config.json", "model.zip", "latest.zip"))
-    if settings.exists() and (there := json.loads(settings.read_text())) != json.loads(
-            json.dumps(asked)):
-        raise ValueError(
-            f"out must be an empty folder or one of the same run; {folder} holds {there}")
+    if settings.exists():
+        there, here = (each | each["config"] for each in (
+            json.loads(settings.read_text()), json.loads(json.dumps(asked))))
+        if differ := [name for name in here if name != "config" and there[name] != here[name]]:
+            found = ", ".join(f"{name} {there[name]}, not {here[name]}" for name in differ)
+            raise ValueError(f"out must be empty, or of the same run; {folder} has {found}")
     if made.exists() and (folder / "sha256").exists() and not latest.exists():
         return made
     world: Any = gym.make(env, disable_env_checker=True, observation="raw",
@@ -214,9 +215,7 @@ def vector_env(env: str, kwargs: dict[str, Any] | None, config: TrainingConfig,
                n_envs: int | None = None) -> InjectionVectorEnv:
     """Build the vector environment; ``ValueError`` if ``env`` is not an injection environment, or
     ``kwargs`` hold arguments that training sets."""
-    if entry(env).track != "injection":
-        known = [id for id, each in entries().items() if each.track == "injection"]
-        raise ValueError(f"env must be one of {', '.join(known)}; got {env!r}")
+    _check.choice("env", env, [id for id, each in entries().items() if each.track == "injection"])
     if taken := {"episodes", "observation", "estimator"} & set(kwargs or {}):
         raise ValueError("kwargs must not hold episodes, an entry of the configuration, nor "
                          "observation and estimator, which training sets; "
@@ -234,8 +233,7 @@ def policy_rewards(policy: str, world: InjectionEnv, path: Path) -> np.ndarray:
     rewards = np.array([
         rollout(world, method, episode, np.random.default_rng(episode))[2]
         for episode in tqdm(range(world.pool.max_episodes), desc=f"rewards of {policy}",
-                            unit="episode",
-                            disable=None)])
+                            unit="episode", disable=None)])
     write_atomically(path, npy(rewards))
     return rewards
 

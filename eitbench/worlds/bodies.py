@@ -30,7 +30,7 @@ DISC_WEIGHTS = np.array([1 / 4, *[1 / 8] * 6])
 class ResistiveDisc(Target):
     """A rigid disc of low conductivity that moves with the mean velocity of the flow over its area.
 
-    Thesis 7.1, where it is a ball. All numbers [ours].
+    Thesis 7.1, where it is a ball. All numbers [E].
     """
 
     background: float = 30.0
@@ -97,18 +97,18 @@ class Cylinders(Target):
     """Two stationary metal cylinders, drawn for each episode (thesis 7.2, Fig. 7.4)."""
 
     background: float = 30.0
-    """mol/m³, about 0.3 S/m: weak saline [ours]"""
+    """mol/m³, about 0.3 S/m: weak saline [E]"""
     large_radius: tuple[float, float] = (0.026, 0.032)
     """m, larger cylinder [T: one is larger; ours: the sizes]"""
     small_radius: tuple[float, float] = (0.018, 0.022)
-    """m, smaller cylinder [ours]"""
+    """m, smaller cylinder [E]"""
     max_centre_radius: float = 0.7
-    """largest distance of a cylinder's centre from the tank's, relative to its radius [ours]"""
+    """largest distance of a cylinder's centre from the tank's, relative to its radius [E]"""
     min_gap: float = 0.05
-    """m, least distance between the cylinders' walls [ours]"""
+    """m, least distance between the cylinders' walls [E]"""
     concentration_ratio: float = 5.0
     """concentration of the metal relative to the background. Its surface has a resistance, and EIT
-    hardly distinguishes conductivities of small bodies above a ratio of five [ours]"""
+    hardly distinguishes conductivities of small bodies above a ratio of five [E]"""
 
     is_advected = False
     is_stationary = True

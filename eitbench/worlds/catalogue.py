@@ -1,6 +1,6 @@
 """All built-in environments: their worlds, settings and page text, in the order of the thesis.
 
-[T] marks numbers of the thesis, [ours] the project's choices.
+[T] marks numbers from the thesis, [E] choices of eitbench.
 """
 
 from dataclasses import replace
@@ -51,7 +51,7 @@ task: estimate the concentration field from the voltages of each injection and a
 The homogeneous estimate has an error of about 0.02, a Kalman filter of about 0.0045.
 `assume={"mean_velocity": 4.0}` gives estimators another velocity than the true one.
 """
-FIXED_LAG_TEXT = "\nThe task requests the state of four injections before.\n"
+FIXED_LAG_TEXT = "\nThe task requests the state with a lag of four time steps.\n"
 SMOOTHING_TEXT = "\nThe task requests every state after the last measurement.\n"
 
 register_example(PIPE_2D, "eitbench/Pipe2D-v0", description=PIPE_2D_TEXT, is_starting_point=True)
@@ -60,12 +60,12 @@ register_example(PIPE_2D, "eitbench/Pipe2DFixedLag-v0", lag=4,
 register_example(PIPE_2D, "eitbench/Pipe2DSmoothing-v0", lag="all", is_starting_point=True,
                  description=PIPE_2D_TEXT + SMOOTHING_TEXT)
 
-# -- 2D pipe with another mean velocity than estimators assume (5.1.2, Figs 5.7, 5.8) --
+# -- 2D pipe with a wrong mean velocity in the task (5.1.2, Figs 5.7, 5.8) --
 
 PIPE_2D_BIASED = World("Pipe2DBiasedVelocity", PlanePipe(),
                        RandomFlow(velocity_range=(2.5, 7.0)), Slugs())
 """The thesis fixes the true velocity, 4.5 m/s, and varies the assumed one. Here the true velocity
-varies, so that methods cannot be tuned to it [ours]. Scores: ``docs/velocity.md``."""
+varies, so that methods cannot be tuned to it [E]. Scores: ``docs/velocity.md``."""
 
 register_example(PIPE_2D_BIASED, "eitbench/Pipe2DBiasedVelocity-v0", description="""
 The pipe of `eitbench/Pipe2D-v0` with a wrong mean velocity in the task: the task specifies 4.5 m/s,
@@ -87,7 +87,7 @@ of θ and the rate at which θ may change. The leaderboard shows the errors of c
 
 PIPE_2D_UNKNOWN = World("Pipe2DUnknownVelocity", PlanePipe(),
                         RandomFlow(velocity_range=(3.0, 6.5), profiles="mean"), Slugs())
-"""The prior of the mean velocity is 4.5 ± 1 m/s [ours]."""
+"""The prior of the mean velocity is 4.5 ± 1 m/s (standard deviation) [E]."""
 
 register_example(PIPE_2D_UNKNOWN, "eitbench/Pipe2DUnknownVelocity-v0", test_seeds="test:0-5",
                  is_starting_point=True, description=f"""
@@ -102,7 +102,7 @@ PIPE_2D_TIME_VARYING = World(
     "Pipe2DTimeVaryingVelocity", PlanePipe(),
     RandomFlow(velocity_range=(3.5, 5.5), oscillation_range=(0.2, 0.35), profiles="mean",
                velocity_walk=0.1), Slugs())
-"""A sine of 20 … 35 % about 3.5 … 5.5 m/s; the task's velocity model is a random walk [ours]."""
+"""A sine of 20 … 35 % about 3.5 … 5.5 m/s; the task's velocity model is a random walk [E]."""
 
 register_example(PIPE_2D_TIME_VARYING, "eitbench/Pipe2DTimeVaryingVelocity-v0",
                  test_seeds="test:0-5", description=f"""
@@ -118,7 +118,7 @@ PIPE_2D_SKEWED = World(
     RandomFlow(velocity_range=(4.0, 5.0), skewness_range=(0.6, 1.0), profiles="three",
                velocity_walk=0.005), Slugs())
 """The true profile is (1 − η²)·exp(kη), which no combination of the three profiles equals; its
-maximum is 0.28 R to 0.41 R off the axis. The steady flow has three parameters [ours]."""
+maximum is 0.28 R to 0.41 R off the axis. The steady flow has three parameters [E]."""
 
 register_example(PIPE_2D_SKEWED, "eitbench/Pipe2DSkewedVelocity-v0", test_seeds="test:0-5",
                  description=f"""
@@ -131,7 +131,7 @@ and a quartic that flattens or sharpens the profile without a net flux (Seppäne
 # -- 2D pipe with a bulge in its lower wall --
 
 PIPE_2D_OBSTACLE = World("Pipe2DObstacle", PlanePipe(bulge=Bulge()), FlowPastBulge(), Slugs())
-"""Behind the bulge the fluid recirculates over more than half of the pipe. All numbers [ours]."""
+"""Behind the bulge the fluid recirculates over more than half of the pipe. All numbers [E]."""
 
 register_extension(PIPE_2D_OBSTACLE, "eitbench/Pipe2DObstacle-v0", description="""
 The pipe of `eitbench/Pipe2D-v0` with a bulge in its lower wall. The flow separates behind the bulge
@@ -145,14 +145,15 @@ better one (Seppänen 2005, 5.1.1, names better fluid models as the next step).
 
 NOMINAL_ID = "eitbench/Pipe2D-v0"
 VARIANT_TEXT = f"""
-All else is as in `{NOMINAL_ID}`, and the task is the same: it specifies the same model, noise and
-velocity, and methods trained for that pipe are compatible. The robustness table compares the scores
-in both (`docs/robustness.md`). `true_model_smoother` receives the true flow and no other change.
+Everything else is as in `{NOMINAL_ID}`, and the task is the same: it specifies the same model,
+noise and velocity, and methods trained for that pipe are compatible. The robustness table compares
+the scores in both (`docs/robustness.md`). `true_model_smoother` receives the true flow; other
+changes are hidden from it.
 """
 
 
 def register_variant(name: str, description: str, **parts: Any) -> World:
-    """Register the thesis' pipe with other ``parts`` under this name, and return it."""
+    """Register the nominal pipe with other ``parts`` (fields of `World`); return the new world."""
     world = replace(PIPE_2D, **parts)
     if world.truth_config != PIPE_2D.truth_config:  # else it shares episodes with the nominal one
         world = replace(world, name=name)
@@ -176,7 +177,7 @@ and priors expect smaller changes.
 
 PIPE_2D_DOUBLE_NOISE = register_variant(
     "Pipe2DDoubleNoise", instrument=Instrument(noise_mismatch=2.0), description="""
-The measurement noise is twice that which the task specifies. The concentration of each episode is
+The measurement noise is twice the noise in the task. The concentration of each episode is
 the same as in the nominal environment.
 """)
 
@@ -204,8 +205,8 @@ to 9 mm, in the nominal environment 10 to 25 mm.
 
 PIPE_3D = World("Pipe3D", RoundPipe(), LaminarFlow(), Slugs(),
                 schedule=Schedule(scored_steps=48, pattern=RotatingRingPattern()))
-"""The available page of the thesis shows the figure only; times, velocity and noise are taken from
-its 2D pipe. Three frames are scored [ours]."""
+"""The available excerpt of thesis 5.2 has the figure only; times, velocity and noise are taken from
+the 2D pipe of the thesis. Three frames are scored [E]."""
 
 PIPE_3D_TEXT = """
 Fluid flows through a round pipe, 40 cm long and 10 cm wide, at 4.5 m/s on average; slugs of higher
@@ -228,9 +229,9 @@ ROTATING_TANK_2D = World(
     "RotatingTank2D", RoundTank(), StirredFlow(), ResistiveDisc(),
     schedule=Schedule(time_step=0.025, scored_steps=64, pattern=SinglePairPattern(), warm_up=16),
     prior=Prior(nodal_std=0.15, initial_std=0.25, initial_length=0.02))
-"""The thesis gives neither sizes nor times: all numbers [ours]. With the pipe's nodal noise of 0.02
-a filter trusts the model too much, which is wrong as in the thesis, and loses a disc near the
-stirrer's circle, where the flow shears most (dev episodes; ``docs/tanks.md``)."""
+"""The thesis gives neither sizes nor times: all numbers [E]. The model has no ball, as in the
+thesis. With the pipe's nodal noise of 0.02 a filter underestimates this model error, and loses a
+disc near the stirrer's circle, where the flow shears most (dev episodes; ``docs/tanks.md``)."""
 
 register_example(ROTATING_TANK_2D, "eitbench/RotatingTank2D-v0", description="""
 The flow in a flat round tank of stirred saline carries a ball with a low conductivity; sixteen
@@ -238,9 +239,9 @@ electrodes are on the wall, and one pair of them injects all the time. A station
 injection shows nothing, but the flow carries the target through the field of the pair, and a filter
 with a flow model can track it (Seppänen 2005, 7.1, Figs 7.2 and 7.3).
 
-The truth is a rigid ball with a separate path; the model in `env.unwrapped.task` is a liquid
-without a ball, in which concentration is advected and diffuses, as in the thesis. The ball starts
-between 0.25 and 0.48 of the radius from the centre, at any angle; the flow is steady.
+The truth is a rigid ball that does not follow the liquid; the model in `env.unwrapped.task` is a
+liquid without a ball, in which concentration is advected and diffuses, as in the thesis. The ball
+starts between 0.25 and 0.48 of the radius from the centre, at any angle; the flow is steady.
 """)
 
 # -- Stationary tank (thesis 7.2) --
@@ -251,7 +252,7 @@ STATIONARY_TANK_2D = World(
                       warm_up=0, calibration=1),
     prior=Prior(nodal_std=0.0, initial_std=0.5, initial_length=0.02))
 """The evolution model is c⁺ = c without noise [T]; Γ_{0|0} is a smoothness prior [T]. Scores begin
-with the first injection, so ĉ_bh is fitted to that injection alone. Two frames of 16 [ours]."""
+with the first injection, so ĉ_bh is fitted to that injection alone. Two frames of 16 [E]."""
 
 register_example(STATIONARY_TANK_2D, "eitbench/StationaryTank2D-v0", is_starting_point=True,
                  description="""
@@ -266,7 +267,7 @@ cylinders are drawn for each episode.
 
 PIPE_2D_CURRENTS = World("Pipe2D", PIPE_2D.vessel, PIPE_2D.flow, PIPE_2D.target,
                          Instrument(noise_floor=2e-4, current_norm="Linf"))
-"""A source for each electrode; with relative noise alone the amplitude would not matter [ours]."""
+"""One current source per electrode; because of the noise floor the amplitude matters [E]."""
 
 INJECTION_TEXT = """
 The pipe of `eitbench/Pipe2D-v0`, where the agent chooses the current pattern at every step. A
@@ -291,8 +292,8 @@ error there. This environment is a reference case too: the normalised adaptivity
 register_injection(PIPE_2D_CURRENTS, "eitbench/Pipe2DInjectionCurrents-v0",
                    description=f"""{INJECTION_TEXT}
 The action is a current for each electrode. This environment is a reference case: the best currents,
-the same at every step, reduce ẽ_c by a tenth relative to pairs, and the clairvoyant policy by
-another 2 %. The normalised adaptivity gap is zero.
+the same at every step, reduce ẽ_c by a tenth relative to pairs; the clairvoyant policy is not
+significantly better. The normalised adaptivity gap is zero.
 
 Actions are relative to the instrument's 0.1 A/m. Entries are clipped to ±1; their mean is
 subtracted (Σ I = 0); if the result exceeds the norm of a pair, it is scaled down to it. The norm is
@@ -306,7 +307,7 @@ PIPE_2D_FAULTS = World(
     "Pipe2D", PIPE_2D.vessel, PIPE_2D.flow, PIPE_2D.target,
     Instrument(noise_floor=1e-4, interference=0.5, n_dead_range=(2, 4), n_failing_range=(1, 2),
                n_loose_range=(0, 2)))
-"""A bad contact adds 0.5 to 2 Ω·m (an intact one has 0.08) and has five times the noise [ours]."""
+"""A bad contact adds 0.5 to 2 Ω·m (an intact one has 0.08) and has five times the noise [E]."""
 
 register_injection(PIPE_2D_FAULTS, "eitbench/Pipe2DInjectionFaults-v0", test_seeds="test:0-49",
                    gate=8.0, description="""
@@ -329,10 +330,10 @@ PIPE_2D_INTERMITTENT = World(
     Slugs(log_amplitude=(0.35, 0.60),
           arrivals=DeadTimePoissonArrivals(dead_time=0.10, mean_wait=0.20)),
     schedule=Schedule(scored_steps=180))
-"""Strong slugs, about three in the scored injections; all numbers [ours]."""
+"""Strong slugs, about three in the scored injections; all numbers [E]."""
 PIPE_2D_BUDGET = replace(PIPE_2D_INTERMITTENT,
                          schedule=replace(PIPE_2D_INTERMITTENT.schedule, budget=30))
-"""The same episodes; the agent may inject in one step of six."""
+"""The same episodes; the agent has a budget of 30 injections, one sixth of the scored steps."""
 
 register_extension(PIPE_2D_INTERMITTENT, "eitbench/Pipe2DIntermittent-v0", test_seeds="test:0-15",
                    description="""
@@ -366,7 +367,7 @@ of the leaderboard (`docs/injection.md`).
 
 PIPE_2D_DRIFTING = World("Pipe2DDriftingVelocity", PlanePipe(), RandomWalkFlow(), Slugs(),
                          region=(0.28, 0.40))
-"""Errors are integrated between two cross-sections; all numbers [ours]."""
+"""Errors are integrated over the last 12 cm of the pipe; all numbers [E]."""
 
 register_injection(PIPE_2D_DRIFTING, "eitbench/Pipe2DInjectionFlow-v0", test_seeds="test:0-29",
                    description="""

@@ -34,7 +34,7 @@ class PipeFlow(Flow):
     mean_velocity: float = 4.5
     """v̄ in m/s [T], as the task specifies it"""
     diffusivity: float = 5e-4
-    """κ in m²/s [ours]: small, but resolved by the mesh of the estimator model"""
+    """κ in m²/s [E]: small, but resolved by the mesh of the estimator model"""
 
     def __post_init__(self) -> None:
         check_positive(self, mean_velocity="m/s", diffusivity="m²/s")
@@ -53,9 +53,7 @@ class PipeFlow(Flow):
         mean = _check.number("assume.mean_velocity", self.mean_velocity if mean is None else mean,
                              low=0.0, units="m/s")
         profile = assumed.get("profile") or "parabolic"
-        if profile not in PROFILES:
-            known = ", ".join(PROFILES)
-            raise ValueError(f"assume.profile must be one of {known}, got {profile!r}")
+        _check.choice("assume.profile", profile, PROFILES)
         if profile == "plug":
             return PlugFlow(mean)
         if profile == "power-law":
@@ -81,7 +79,7 @@ class RandomFlow(PipeFlow):
     """
 
     velocity_range: tuple[float, float] = (2.5, 7.0)
-    """m/s, true mean, uniform; the thesis assumes 2 and 7 for a true 4.5 [ours]"""
+    """m/s, true mean, uniform; the thesis assumes 2 and 7 for a true 4.5 [E]"""
     oscillation_range: tuple[float, float] = (0.0, 0.0)
     """amplitude of the mean velocity's sine in time, relative to the mean"""
     period_range: tuple[float, float] = (0.4, 0.8)
@@ -91,9 +89,9 @@ class RandomFlow(PipeFlow):
     profiles: str | None = None
     """requested estimate: None, the ``mean`` of a parabola, or ``three`` numbers of a profile"""
     velocity_std: float = 1.0
-    """m/s, standard deviation of the prior [ours]"""
+    """m/s, standard deviation of the prior [E]"""
     velocity_walk: float = 0.02
-    """m/s per time step, standard deviation of the assumed random walk [ours]"""
+    """m/s per time step, standard deviation of the assumed random walk [E]"""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -142,7 +140,7 @@ class RandomFlow(PipeFlow):
 
 @dataclass(frozen=True)
 class RandomWalkFlow(PipeFlow):
-    """Parabolic flow in a plane pipe with a random walk of the mean velocity; all numbers [ours].
+    """Parabolic flow in a plane pipe with a random walk of the mean velocity; all numbers [E].
 
     At every time step the velocity changes by ±``velocity_walk``, which is also the walk in the
     task. It is reflected at the ends of ``velocity_range``.
@@ -191,7 +189,7 @@ class FlowPastBulge(PipeFlow):
     """Steady Navier–Stokes flow through a plane pipe with a bulge, behind which it separates.
 
     The thesis names better fluid models as its next step (5.1.1). The task contains the walls and,
-    by default, a flow that is parabolic between them at each x. All numbers [ours].
+    by default, a flow that is parabolic between them at each x. All numbers [E].
     """
 
     viscosity: float = 5e-4
@@ -208,9 +206,7 @@ class FlowPastBulge(PipeFlow):
     def check_assumed(self, world: World, assumed: Mapping[str, Any]) -> None:
         """Accept ``flow``, one of `BULGE_FLOW_ASSUMPTIONS`."""
         reject_unknown_assumptions(assumed, ("flow",))
-        if (flow := assumed.get("flow", "parabolic")) not in BULGE_FLOW_ASSUMPTIONS:
-            known = ", ".join(BULGE_FLOW_ASSUMPTIONS)
-            raise ValueError(f"assume.flow must be one of {known}, got {flow!r}")
+        _check.choice("assume.flow", assumed.get("flow", "parabolic"), BULGE_FLOW_ASSUMPTIONS)
 
     def assumed_velocity(self, world: World, **assumed: Any) -> VelocityField:
         self.check_assumed(world, assumed)
@@ -226,7 +222,7 @@ class FlowPastBulge(PipeFlow):
 
 @dataclass(frozen=True)
 class StirredFlow(Flow):
-    """Steady Navier–Stokes flow in a round tank with a stirrer (thesis 7.1); all numbers [ours].
+    """Steady Navier–Stokes flow in a round tank with a stirrer (thesis 7.1); all numbers [E].
 
     The velocity is zero on the wall; at a distance d from the stirrer's axis the force along its
     circle is force·exp(−((d − radius)/width)²/2).

@@ -34,7 +34,7 @@ class Faults(NamedTuple):
 
 @dataclass(frozen=True)
 class Instrument:
-    """Current sources and voltmeters, intact by default. [T]: number of the thesis; others [ours].
+    """Current sources and voltmeters, intact by default. [T]: from the thesis; [E]: of eitbench.
 
     A broken wire leaves the electrode in place as an electrode without net current, so that the
     episode's transfer resistances stay exact. A current through a broken wire does not flow, and
@@ -43,7 +43,7 @@ class Instrument:
     """
 
     current: float = 0.1
-    """A (A/m in 2D); with relative noise the amplitude does not matter [ours]"""
+    """A (A/m in 2D); with relative noise the amplitude does not matter [E]"""
     noise_relative: float = 0.01
     """std relative to the measurement [T]"""
     noise_relative_to_max: float = 0.001
@@ -78,9 +78,8 @@ class Instrument:
         _check.number("noise_relative_to_max", self.noise_relative_to_max, low=0.0, open_low=True)
         for name, units in (("noise_relative", ""), ("noise_floor", "V"), ("interference", "V")):
             _check.number(name, getattr(self, name), low=0.0, units=units)
-        if self.current_norm is not None and self.current_norm not in CURRENT_NORMS:
-            raise ValueError(f"current_norm must be one of {', '.join(CURRENT_NORMS)}, "
-                             f"got {self.current_norm!r}")
+        if self.current_norm is not None:
+            _check.choice("current_norm", self.current_norm, CURRENT_NORMS)
         _check.number("loose_noise", self.loose_noise, low=1.0)
         _check.number("noise_mismatch", self.noise_mismatch, low=0.0)
         _check.number("contact_impedance_spread", self.contact_impedance_spread, low=0.0, high=0.95)

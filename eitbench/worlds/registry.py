@@ -117,10 +117,8 @@ def register(world: World, id: str, *, track: str = "estimation", description: s
         texts[EARLIER_KEYWORDS[old]] = settings.pop(old)
     if not re.fullmatch(r"[\w.-]+/[\w.-]+-v\d+", id):
         raise ValueError(f"id must look like 'namespace/Name-v0', got {id!r}")
-    if track not in ENV_CLASSES:
-        raise ValueError(f"track must be one of {', '.join(ENV_CLASSES)}, got {track!r}")
-    if group not in GROUPS:
-        raise ValueError(f"group must be one of {', '.join(GROUPS)}, got {group!r}")
+    _check.choice("track", track, ENV_CLASSES)
+    _check.choice("group", group, GROUPS)
     if unknown := sorted(set(settings) - set(ID_SETTINGS[track])):
         raise ValueError(f"settings of the track {track} must be among "
                          f"{', '.join(ID_SETTINGS[track])}; got {', '.join(unknown)}")
@@ -189,19 +187,16 @@ def entries() -> dict[str, Entry]:
 
 def entry(id: str, variant: str | None = None) -> Entry:
     """Return the entry of an id, or of the id's ``variant``; ``ValueError`` if it is unknown."""
-    if id not in _entries:
-        raise ValueError(f"env must be one of {', '.join(_entries)}; got {id!r}"
-                         + _check.did_you_mean(id, _entries))
+    _check.choice("env", id, _entries)
     if variant is None:
         return _entries[id]
     variants: dict[str, Entry] = {}
     for each in _entries.values():
         if each.nominal == id:
             variants.setdefault(each.variant, each)
-    if variant not in variants:
-        raise ValueError(f"variant of {id} must be one of {', '.join(variants)}; got {variant!r}"
-                         + _check.did_you_mean(variant, variants) if variants else
-                         f"{id} has no variants, got {variant!r}")
+    if not variants:
+        raise ValueError(f"{id} has no variants, got {variant!r}")
+    _check.choice(f"variant of {id}", variant, variants)
     return variants[variant]
 
 

@@ -26,7 +26,7 @@ class OppositeDiagonalPattern:
     """Alternating opposite and diagonal pairs of a plane pipe; diagonals span three electrodes.
 
     Successive injections are far apart, so that each section of the pipe is measured before the
-    fluid has left it [ours]. Electrodes 0 … L/2−1 are on the lower wall, L/2 … L−1 on the upper
+    fluid has left it [E]. Electrodes 0 … L/2−1 are on the lower wall, L/2 … L−1 on the upper
     wall, both in flow direction.
     """
 
@@ -48,7 +48,7 @@ class OppositeDiagonalPattern:
 class RotatingRingPattern:
     """Opposite pairs within a ring of a round pipe, alternating with pairs into the next ring.
 
-    The rings alternate, and the angle advances by three positions each time [ours]. Electrode
+    The rings alternate, and the angle advances by three positions each time [E]. Electrode
     number = ring·(electrodes per ring) + position in the ring.
     """
 
@@ -78,7 +78,7 @@ class SinglePairPattern:
 
 @dataclass(frozen=True)
 class TankOppositeDiagonalPattern:
-    """Eight opposite, then eight diagonal pairs of a tank; successive ones are far apart [ours]."""
+    """Eight opposite, then eight diagonal pairs of a tank; successive ones are far apart [E]."""
 
     def __call__(self, vessel: RoundTank) -> np.ndarray:
         half = vessel.n_electrodes // 2
@@ -103,7 +103,7 @@ class Schedule:
     time_step: float = 5e-3
     """s between two injections [T]"""
     scored_steps: int = 80
-    """scored injections: five frames [ours]"""
+    """scored injections: five frames [E]"""
     pattern: Pattern = field(default_factory=OppositeDiagonalPattern)
     """cycle of current patterns"""
     warm_up: int | None = None

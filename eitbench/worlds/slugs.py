@@ -35,7 +35,7 @@ class JitteredArrivals:
     """One slug in each interval, at a uniform time within it."""
 
     interval: float = 0.020
-    """s [ours]"""
+    """s [E]"""
 
     def __post_init__(self) -> None:
         check_positive(self, interval="s")
@@ -47,7 +47,7 @@ class JitteredArrivals:
 
 @dataclass(frozen=True)
 class DeadTimePoissonArrivals:
-    """Poisson arrivals with a dead time after each slug; all numbers [ours].
+    """Poisson arrivals with a dead time after each slug; all numbers [E].
 
     After the dead time the arrival rate is constant, so that the time without a slug does not
     predict the next arrival.
@@ -72,7 +72,7 @@ class DeadTimePoissonArrivals:
 
 @dataclass(frozen=True)
 class Slugs(Target):
-    """Slugs of both signs, Gaussian in r and t: c_in = background·exp(Σ ±a·g(r)·g(t)) [ours]."""
+    """Slugs of both signs, Gaussian in r and t: c_in = background·exp(Σ ±a·g(r)·g(t)) [E]."""
 
     background: float = 30.0
     """mol/m³, about 0.3 S/m: weak saline"""

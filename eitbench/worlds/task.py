@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 
 class Estimate(NamedTuple):
-    """Estimate of one state, with n nodes, L electrodes and k flow parameters.
+    """Estimate of one state: n nodes, L measurements of an injection, k flow parameters.
 
     Attributes
     ----------
@@ -54,13 +54,13 @@ class Task:
     transport : Transport
         Evolution model on ``mesh``, with the nominal flow.
     observation : ObservationModel
-        Model of the voltages for a concentration on ``mesh``.
+        Voltages as a function of a concentration on ``mesh``.
     noise : VoltageNoise
         Its ``std(voltages)`` is the standard deviation of each measurement, V.
     currents : (K, L) array
         Injection cycle, A (A/m in 2D).
     n_steps : int
-        Measurement vectors of an episode, t = 1 … n_steps.
+        Number of measurement vectors of an episode, t = 1 … n_steps.
     warm_up : int
         States t ≤ ``warm_up`` are not scored.
     lag : int
@@ -68,7 +68,7 @@ class Task:
     expected_concentration : float
         Rough expectation in mol/m³, at which the fit of the homogeneous estimate starts.
     calibration : int
-        First injections, to which the homogeneous estimate is fitted; usually in the warm-up.
+        Number of first injections to which ĉ_bh is fitted; usually in the warm-up.
     prior : Prior
         Prior of the target relative to the best homogeneous estimate (thesis Table 5.1).
     velocity : VelocityModel, optional
@@ -99,7 +99,7 @@ class Task:
         return self.transport.mesh
 
     def transport_at(self, parameters: np.ndarray) -> ConvectionDiffusion:
-        """Return the transport with flow parameters θ (k,) in m/s; ``ValueError`` without such."""
+        """Return the transport for flow parameters θ (k,) in m/s; ``ValueError`` if it has none."""
         from eitbench.physics.transport import ConvectionDiffusion
         if self.velocity is None or not isinstance(self.transport, ConvectionDiffusion):
             raise ValueError("the flow has no parameters in this task")
@@ -120,8 +120,10 @@ def make_task(world: World, lag: int | str = 0, **assumed: Any) -> Task:
     lag : int or "all"
         See `Task`; "all" requests all states after the last measurement.
     assumed
-        Wrong assumptions on the flow, as ``mean_velocity``; see `World.estimator_model`.
+        Other assumptions on the flow than the default; see `World.estimator_model`.
     """
+    if not isinstance(world, World):
+        raise TypeError(f"world must be a World, as of gymnasium.make(id).unwrapped, got {world!r}")
     steps = lag_steps(world, lag)
     model = _model(world.truth_config, tuple(sorted(assumed.items())))
     currents = world.currents
@@ -141,5 +143,5 @@ def lag_steps(world: World, lag: int | str) -> int:
 
 @lru_cache(maxsize=4)
 def _model(config: World, assumed: tuple[tuple[str, Any], ...]) -> Discretisation:
-    """Return one model per process, by which estimators cache derived matrices."""
+    """Return the same object in each call: estimators cache derived matrices for it."""
     return config.estimator_model(**dict(assumed))

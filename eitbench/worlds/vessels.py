@@ -18,10 +18,13 @@ if TYPE_CHECKING:
     from eitbench.numerics.mesh_files import MeshData
     from eitbench.physics.cem import CompleteElectrodeModel
 
+MAX_COVERAGE = 0.95
+"""Largest fraction of a wall that electrodes cover."""
+
 
 @dataclass(frozen=True)
 class Bulge:
-    """A bulge of the lower wall and its electrodes: y = −R + h·exp(−((x − x₀)/w)²) [ours]."""
+    """A bulge of the lower wall and its electrodes: y = −R + h·exp(−((x − x₀)/w)²) [E]."""
 
     height: float = 0.02
     """h in m: a fifth of the pipe's width"""
@@ -45,7 +48,7 @@ class Bulge:
 class PlanePipe:
     """A plane channel along x between walls y = ±R, possibly with a bulge in the lower wall.
 
-    [T]: number of the thesis (5.1.1); [ours]: choice of this project.
+    [T]: number of the thesis (5.1.1); [E]: choice of this project.
     """
 
     length: float = 0.40
@@ -53,13 +56,13 @@ class PlanePipe:
     half_width: float = 0.05
     """R in m [T]"""
     electrodes_per_wall: int = 8
-    """16 electrodes on both walls [ours]"""
+    """16 electrodes on both walls [E]"""
     electrode_coverage: float = 0.5
-    """fraction of the wall that electrodes cover, evenly spaced [ours]"""
+    """fraction of the wall that electrodes cover, evenly spaced [E]"""
     contact_impedance: float = 2e-3
-    """z in Ω·m² [ours]"""
+    """z in Ω·m² [E]"""
     molar_conductivity: float = 0.01
-    """Λ in S·m²/mol; σ = Λc is linear [T], with about the slope of NaCl [ours]"""
+    """Λ in S·m²/mol; σ = Λc is linear [T], with about the slope of NaCl [E]"""
     bulge: Bulge | None = None
     """of the lower wall"""
 
@@ -152,7 +155,7 @@ class PlanePipe:
 class RoundPipe:
     """A straight round pipe along z with rings of electrodes on its wall (thesis 5.2, Fig. 5.10).
 
-    The available page of the thesis shows the figure only: sizes and electrodes are [ours].
+    The available page of the thesis shows the figure only: sizes and electrodes are [E].
     """
 
     length: float = 0.40
@@ -160,17 +163,17 @@ class RoundPipe:
     radius: float = 0.05
     """R in m [ours: as in 2D]"""
     electrode_rings: int = 4
-    """rings of electrodes along the pipe [ours]"""
+    """rings of electrodes along the pipe [E]"""
     electrodes_per_ring: int = 8
-    """32 electrodes in all [ours]"""
+    """32 electrodes in all [E]"""
     electrode_length: float = 0.04
-    """m along the pipe [ours]"""
+    """m along the pipe [E]"""
     electrode_coverage: float = 0.5
-    """fraction of a ring that electrodes cover, evenly spaced [ours]"""
+    """fraction of a ring that electrodes cover, evenly spaced [E]"""
     contact_impedance: float = 2e-3
-    """z in Ω·m² [ours]"""
+    """z in Ω·m² [E]"""
     molar_conductivity: float = 0.01
-    """Λ in S·m²/mol; σ = Λc [ours]"""
+    """Λ in S·m²/mol; σ = Λc [E]"""
     potential_order: int = 2
     """order of the elements for the potential. With P1 and the same number of unknowns the error is
     three times larger and exceeds the noise: ``docs/pipe3d.md``"""
@@ -258,7 +261,7 @@ class RoundPipe:
 
 @dataclass(frozen=True)
 class RoundTank:
-    """A flat round tank with electrodes on its wall (thesis ch. 7). All numbers [ours]."""
+    """A flat round tank with electrodes on its wall (thesis ch. 7). All numbers [E]."""
 
     radius: float = 0.14
     """m"""
@@ -384,7 +387,7 @@ class MeshVessel:
 def _check_electrodes(vessel: PlanePipe | RoundPipe | RoundTank) -> None:
     """Raise ``ValueError`` unless numbers of electrodes and liquid are in range."""
     check_positive(vessel, contact_impedance="Ω·m²", molar_conductivity="S·m²/mol")
-    _check.number("electrode_coverage", vessel.electrode_coverage, low=0.0, high=0.95,
+    _check.number("electrode_coverage", vessel.electrode_coverage, low=0.0, high=MAX_COVERAGE,
                   open_low=True)
 
 

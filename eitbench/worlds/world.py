@@ -159,13 +159,13 @@ class Prior:
     """Prior of the estimators; standard deviations relative to ĉ_bh (thesis Table 5.1)."""
 
     expected_concentration: float = 25.0
-    """mol/m³; a rough concentration, deliberately not the background [ours]"""
+    """mol/m³; a rough concentration, deliberately not the background [E]"""
     inflow_std: float = 1 / 4
     """of the inflow noise η [T]"""
     nodal_std: float = 1 / 50
-    """of the nodal noise e [ours; illegible in the table]"""
+    """of the nodal noise e [E; illegible in the table]"""
     initial_std: float = 1 / 4
-    """of the initial state [ours; illegible in the table]"""
+    """of the initial state [E; illegible in the table]"""
     initial_length: float = 0.0
     """m, correlation length of the initial state; 0: nodes are independent"""
 
@@ -304,8 +304,8 @@ class World:
     def estimator_model(self, **assumed: Any) -> Discretisation:
         """Return the coarser discretisation of the task.
 
-        ``assumed`` holds wrong assumptions on the flow, arguments of `Flow.assumed_velocity`;
-        ``ValueError`` for an unknown one.
+        ``assumed`` holds other assumptions on the flow than the default, such as ``mean_velocity``:
+        arguments of `Flow.assumed_velocity`. ``ValueError`` for an unknown one.
         """
         return self._discretise(self.flow.assumed_velocity(self, **assumed), fine=False)
 

@@ -51,14 +51,15 @@ def test_invalid_files_are_reported(source, message, tmp_path):
 
 
 def test_unknown_baselines(tmp_path):
-    """The message lists built-in names. A file that is too large is not read."""
+    """The message lists similar built-in names, or names the missing file. A file that is too large is not read."""
     path = tmp_path / "mine.py"
     path.touch()
     os.truncate(path, MAX_METHOD_BYTES + 1)
     with pytest.raises(ValueError, match="must have 256 MiB at most"):
         load_method(str(path), "estimation")
-    for name in ("kalman", "no/such/file.py", ""):
-        with pytest.raises(ValueError, match=r"one of .*homogeneous.*got"):
+    for name, message in (("kalman", r"one of kalman_filter, .*got 'kalman'. Did you mean kalman_filter\?"),
+                          ("no/such/file.py", "no/such/file.py does not exist"), ("", "one of .*got ''")):
+        with pytest.raises(ValueError, match=message):
             load_method(name, "estimation")
 
 
@@ -93,7 +94,7 @@ def test_only_registered_names_are_built_in(track, tmp_path, monkeypatch):
     for name in (str(tmp_path / "insider"), "insider", "./insider", f"../{tmp_path.name}/insider",
                  f"{ours}/../../insider", "", "."):
         assert not is_builtin(name)
-        with pytest.raises(ValueError, match=f"or one of .*; got {re.escape(repr(name))}"):
+        with pytest.raises(ValueError, match=f"must be one of .*; got {re.escape(repr(name))}"):
             load_method(name, track)
     assert is_builtin(ours) and not is_builtin(str(path))
     link = tmp_path / f"{ours}.py"

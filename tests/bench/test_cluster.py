@@ -83,7 +83,7 @@ def test_without_a_cluster_a_killed_worker_ends_the_run_without_losses(tmp_path)
 
 def test_unavailable_backends_are_reported(monkeypatch):
     """Unknown or missing backends have an error message."""
-    with pytest.raises(ValueError, match="backend must be one of loky, ray, dask, got 'slurm'"):
+    with pytest.raises(ValueError, match="backend must be one of loky, ray, dask; got 'slurm'"):
         list(run_parallel(print, [(1,)], 1, "slurm"))
     with monkeypatch.context() as patch, pytest.raises(ModuleNotFoundError):
         patch.setattr(parallel, "_with_ray", lambda *_: iter(importlib.import_module("ray_is_not_here")))

@@ -156,7 +156,7 @@ def test_third_party_files_need_bubblewrap_where_strict(monkeypatch):
             choose_isolation(FILTER, "mine.py", **asked)
     with pytest.raises(ValueError, match="isolate must be bubblewrap or process"):
         choose_isolation(FILTER, "mine.py", "none", strict=True)
-    with pytest.raises(ValueError, match="isolate must be one of auto, none, process, bubblewrap, got 'never'"):
+    with pytest.raises(ValueError, match="isolate must be one of auto, none, process, bubblewrap; got 'never'"):
         suites.make_jobs("estimation", [FILTER.id], ["homogeneous"], [1], isolate="never")
 
 

@@ -245,7 +245,7 @@ def test_unknown_names_are_reported(tmp_path):
         load_method(str(tmp_path / "greedy_a.zip"), "injection")
     with pytest.raises(ValueError, match="environment eitbench/Pipe2D-v0 is not of the track injection"):
         injected("eitbench/Pipe2D-v0", {}, "adjacent", 1)
-    with pytest.raises(ValueError, match="estimator must be one of full, reduced, got 'none'"):
+    with pytest.raises(ValueError, match="estimator must be one of full, reduced; got 'none'"):
         injected(NAME, SHORT, "adjacent", 1, "none")
 
 

@@ -161,6 +161,7 @@ def test_oracle_in_a_changing_flow(vessel):
                            for name in ("true_model_smoother", "kalman_filter"))
     assert reference["error"] < 0.9 * guessing["error"]
     assert reference["velocity_error"] < 1e-20 < guessing["velocity_error"]
+    assert reference["solute_flow_error"] < 0.1 < guessing["solute_flow_error"]
 
 
 def test_modified_arrays_of_estimators_change_nothing(tmp_path):

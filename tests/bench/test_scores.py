@@ -51,6 +51,13 @@ def test_innovations_and_velocity_if_reported():
     assert said["nis"] == pytest.approx(2.0) and said["velocity_error"] == pytest.approx(0.01)
 
 
+def test_solute_flow():
+    """Flows (3, 6) mol/s of true (4, 3): RMS √(10/25), amount 9 of 7."""
+    said = compute_scores("estimation", outcome(solute_flow=(np.array([3.0, 6.0]), np.array([4.0, 3.0]))))
+    assert said["solute_flow_error"] == pytest.approx(0.4**0.5)
+    assert said["solute_amount_error"] == pytest.approx(2 / 7)
+
+
 def test_policies_have_theirs():
     """Policies have error, injections, time, and scores of the filter's uncertainty if it is available."""
     said = compute_scores("injection", Outcome(WORLD, 0.5, np.array([0.1, 0.3]), n_injections=7))
@@ -114,8 +121,8 @@ def test_only_scores_with_a_direction_are_compared(name, records):
     ({"name": "error"}, "has the name or heading of another, error"),
     ({"heading": "CRPS"}, "has the name or heading of another, crps"),
     ({"better": "more"}, "direction must be one of lower, higher"),
-    ({"requires": ("luck",)}, "requires must be among world, .*got 'luck'"),
-    ({"tracks": ("sprint",)}, "tracks must be among estimation, injection, measured; got 'sprint'"),
+    ({"requires": ("luck",)}, "each of requires must be one of .*got 'luck'"),
+    ({"tracks": ("sprint",)}, "each of tracks must be one of estimation, injection, measured; got 'sprint'"),
     ({"factor": 0.0}, "factor must be")])
 def test_invalid_scores_are_rejected(changes, message, apart):
     """Nothing is registered."""

@@ -385,13 +385,15 @@ def test_records_of_the_baseline_are_not_used():
     (["r.json", "--secret", "salt"], "--held-out and --secret belong together"),
     (["r.json", "--episodes", "0"], "--episodes must be at least 1 without --held-out, got 0"),
     (["r.json", "--held-out", "3", "--secret", "none"], "must be a file of hexadecimal digits"),
+    (["r.json"], "records must be files, got r.json"),
 ])
-def test_mistakes_are_explained(arguments, message):
+def test_mistakes_are_explained(arguments, message, tmp_path):
     """Exit status 2, different from an invalid record."""
     code, said, complaint = eitbench("verify", *arguments)
     assert code == 2 and said == "" and message in complaint
-    code, _, complaint = eitbench("verify", "record.json")
-    assert code == 1 and "record record.json cannot be read" in complaint
+    (tmp_path / "record.json").write_text("{}")
+    code, _, complaint = eitbench("verify", str(tmp_path / "record.json"))
+    assert code == 1 and "not verified: record.json" in complaint
 
 
 def test_the_workflow_calls_an_existing_command():

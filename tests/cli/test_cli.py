@@ -196,7 +196,7 @@ def test_documented_commands_are_commands():
     (["run", "--baseline", "kalman_fliter"], "Did you mean kalman_filter?"),
     (["run", "--set", "instrument.noise_relativ=0.1"], "Did you mean noise_relative?"),
     (["compare", "kalmann_filter", "homogeneous"], "Did you mean kalman_filter?"),
-    (["run", "--baseline", "nowhere.py"], "got 'nowhere.py'"),
+    (["run", "--baseline", "nowhere.py"], "baseline nowhere.py does not exist"),
     (["run", "--baseline", "mine.py", "--baseline", "other/mine.py", "--seeds", "dev:1", "-j", "1"], "other/mine.py"),
     (["run", "--baseline", "empty.py"], "empty.py must define a class Estimator with a method update"),
     (["run", "--baseline", "broken.py"], "broken.py"),

@@ -169,7 +169,7 @@ def test_full_disk_is_refused_before_anything_is_simulated(place, asked, monkeyp
 
 @pytest.mark.parametrize(("arguments", "message"), [
     (["--seeds", "exam:1"], "seeds must name one of the splits train, dev, test, got 'exam:1'"),
-    (["--env", "eitbench/Pipe4D-v0"], "env must be one of eitbench/Pipe2D-v0"),
+    (["--env", "eitbench/Pipe4D-v0"], "env must be one of eitbench/Pipe"),
     (["-j", "0"], "--jobs"),
 ])
 def test_mistakes_are_explained(arguments, message, place, asked):

@@ -241,7 +241,7 @@ def test_invalid_files_are_rejected(tmp_path, text):
 def test_invalid_arguments_are_rejected():
     with pytest.raises(ValueError, match=r"the prior must be for the task's inlet, 0 nodes"):
         InflowWindow(make_task(ROTATING_TANK), prior(), LEVEL)
-    with pytest.raises(ValueError, match="link must be one of linear, logarithm, got 'log'"):
+    with pytest.raises(ValueError, match="link must be one of linear, logarithm; got 'log'"):
         InflowPrior("log", prior().points, prior().modes, prior().correlation, 0.005)
     with pytest.raises(ValueError, match="correlation must begin with 1"):
         InflowPrior("linear", prior().points, prior().modes, np.array([0.9, 0.1]), 0.005)

@@ -99,7 +99,7 @@ def test_invalid_entries_are_named(folder, change, message):
 
 
 def test_unknown_and_incomplete_cases_are_named(tmp_path):
-    with pytest.raises(ValueError, match=r"case must be one of iirc, .*Did you mean iirc"):
+    with pytest.raises(ValueError, match=r"case, if not a YAML file, must be one of .*Did you mean iirc"):
         read_case("irc")
     (tmp_path / "a.yml").write_text("title: a rod", encoding="utf-8")
     with pytest.raises(ValueError, match="must have file, sha256, licence, source, vessel"):

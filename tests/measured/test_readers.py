@@ -207,7 +207,7 @@ def test_tables_of_differences(tmp_path):
                  described_table(tmp_path / "b.csv", readings="neighbours")):
         np.testing.assert_array_equal(each.matrix, MATRIX)
     np.testing.assert_array_equal(described_table(tmp_path / "c.csv", titles, "potentials").matrix, np.eye(8))
-    with pytest.raises(ValueError, match="readings must be one of potentials, neighbours, got 'volts'"):
+    with pytest.raises(ValueError, match="readings must be one of potentials, neighbours; got 'volts'"):
         described_table(tmp_path / "d.csv", readings="volts")
 
 

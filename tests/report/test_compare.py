@@ -79,7 +79,7 @@ def test_over_environments_gains_are_compared():
              record(name, (other * 2.0 * noise).tolist(), id=TANK, official=True)]
             for name, scale, other in (("a", 0.25, 0.52), ("b", 0.5, 0.5)))
     table = compare(a, b, zero=floor)
-    assert list(table["environment"]) == [PIPE_NAME, TANK_NAME, "all filter"]
+    assert list(table["environment"]) == [PIPE_NAME, TANK_NAME, "all filter (2 environments)"]
     assert list(table["score"]) == ["error", "error", "skill score"] and table["episodes"][2] == 24
     one, other = ({name: {seed: 1 - error / scale for seed, error in errors.items()}
                    for (name, errors), scale in zip(errors_of(side).items(), (0.02, 2.0), strict=True)}

@@ -50,10 +50,10 @@ def test_interval_is_students(values):
 @pytest.mark.parametrize(("mean", "half", "text"), [
     (0.00534, 0.00041, "0.0053 ± 0.0004"), (0.00534, 0.00013, "0.00534 ± 0.00013"), (1.234, 0.5, "1.2 ± 0.5"),
     (12.34, 3.0, "12 ± 3"), (123.4, 1.2, "123.4 ± 1.2"), (0.0096, 0.00096, "0.0096 ± 0.0010"),
-    (0.0123, math.inf, "0.0123"), (2.0, 0.0, "2"), (0.0, 0.0, "0"),
+    (0.0123, math.inf, "0.0123"), (2.0, 0.0, "2"), (0.0, 0.0, "0"), (0.0129, 0.02, "0.013 ± 0.020"),
 ])
 def test_rounded_examples(mean, half, text):
-    """The interval has one significant digit, two after a 1; the mean has the same number of decimals."""
+    """One digit of the interval, two after a 1 or if the mean would have only one; equal decimals."""
     assert format_mean(mean, half) == text
 
 

@@ -208,7 +208,7 @@ def test_the_line_of_an_agent_is_the_mean_of_its_trainings():
     assert {part.cells["rank"] for part in parts[:3]} == {1}
     first = page_table(board, "").rows[0]
     assert first.cells[0].text == "1" and first.cells[1].note == "mean of 4 training seeds"
-    assert "each 0.110 to 0.131" in first.cells[2].note and len(first.children) == 4
+    assert "; seeds 0.110 to 0.131" in first.cells[2].note and len(first.children) == 4
     assert len(markdown_table(board).rows) == len(board.rows)
 
 

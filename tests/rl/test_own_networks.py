@@ -168,7 +168,7 @@ def test_a_method_is_its_file_and_the_files_it_names(policy, tmp_path):
     assert load_method(str(policy), "injection").sha256 != before
     for text, message in [('("agent.pt", "other.npz")', "files must name files in the folder of the method, got 'oth"),
                           ('("../agent.pt",)', "files must name files in the folder"),
-                          ('"agent.pt"', "files must be a tuple of names")]:
+                          ('"agent.pt"', "files must be a literal tuple of names")]:
         policy.write_text(POLICY.replace('("agent.pt",)', text))
         with pytest.raises(ValueError, match=message):
             load_method(str(policy), "injection")

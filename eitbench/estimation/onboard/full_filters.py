@@ -1,4 +1,4 @@
-"""Exact filters of the episodes of an injection environment, for scored runs."""
+"""Full filters of the episodes of an injection environment, for scored runs."""
 
 from __future__ import annotations
 

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from eitbench import _check
 from eitbench.estimation.onboard.episode_filters import EpisodeFilters
 from eitbench.estimation.onboard.full_filters import FullFilters
 from eitbench.estimation.onboard.reduced_filters import ReducedFilters
@@ -14,23 +15,21 @@ if TYPE_CHECKING:
     from eitbench.estimation.onboard.rules import Rules
 
 ESTIMATOR_OPTIONS = ("reduced", "full", "none")
-"""Reduced filter for training, exact filter for scores, or no filter."""
+"""Reduced filter for training, full filter for scores, or no filter."""
 FAULT_EMA_WEIGHT = 0.2
 """Weight of the last injection in the moving average of the fraction of rejected measurements."""
 
 
 def filters_class(rules: Rules, estimator: str) -> type[EpisodeFilters] | None:
-    """Return the class for a name, None for "none"; ``ValueError`` if it does not exist for these
-    rules."""
-    if estimator not in ESTIMATOR_OPTIONS:
-        raise ValueError(f"estimator must be one of {', '.join(ESTIMATOR_OPTIONS)}, "
-                         f"got {estimator!r}")
+    """Return the filters' class for one of `ESTIMATOR_OPTIONS`, None for "none". ``ValueError`` for
+    another option, or if the rules have a learned inflow that the world does not permit."""
+    _check.choice("estimator", estimator, ESTIMATOR_OPTIONS)
     if estimator == "none":
         return None
     if rules.inflow == "learned":
         if not hasattr(rules.world.target, "draw_inflow"):
             raise ValueError("inflow must be 'white' for a target without inflow, got 'learned' "
-                             f"and a target {type(rules.world.target).__name__}")
+                             f"for the target {type(rules.world.target).__name__}")
         if rules.world.velocity_model is not None:
             raise ValueError("inflow must be 'white' where the velocity is estimated too, "
                              f"got {rules.inflow!r}")
@@ -42,7 +41,7 @@ class OnboardFilter:
 
     Parameters
     ----------
-    kind : type of EpisodeFilters
+    kind : type of EpisodeFilters, from `filters_class`
     rules : Rules
     frames : (B, K, L)
         Voltages in V of the first frame.
@@ -57,8 +56,8 @@ class OnboardFilter:
     def assimilate(self, voltages: np.ndarray, currents: np.ndarray) -> None:
         """Assimilate voltages (B, L) in V of one step, for currents (B, L) in A (A/m in 2D)."""
         self._innovations, accepted = self.filters.assimilate(voltages, currents)
-        # Recent fraction per electrode of rejected measurements, and of failed injections through
-        # it.
+        # Fault scores of each electrode: moving averages of the fraction of rejected measurements
+        # at it, and of failed injections through it.
         reading = self._doubt[:, 0]
         driving = self._doubt[:, 1]
         injected = currents.any(axis=1, keepdims=True)
@@ -69,8 +68,8 @@ class OnboardFilter:
         driving += FAULT_EMA_WEIGHT * drives * (failed - driving)
 
     def features(self) -> dict[str, np.ndarray]:
-        """Return arrays (B, …): innovations, mean, std, doubt (fault scores), and if the velocity
-        is estimated, its mean and standard deviation."""
+        """Return innovations (B, L) in predicted standard deviations, mean and std (B, patches) in
+        mol/m³, the fault scores doubt (B, 2, L), and, if estimated, velocity and its std in m/s."""
         mean, std = self.filters.coarse_grid()
         shown = {"innovations": self._innovations.copy(), "mean": mean, "std": std,
                  "doubt": self._doubt.copy()}

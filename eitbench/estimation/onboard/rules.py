@@ -49,9 +49,7 @@ class Rules:
     def __post_init__(self) -> None:
         if self.gate != np.inf:
             _check.number("gate", self.gate, low=0.0, open_low=True)
-        if self.inflow not in INFLOW_MODELS:
-            raise ValueError(f"inflow must be one of {', '.join(INFLOW_MODELS)}, "
-                             f"got {self.inflow!r}")
+        _check.choice("inflow", self.inflow, INFLOW_MODELS)
 
     @property
     def instrument(self) -> Instrument:

@@ -310,9 +310,10 @@ def method_page(site: Site, name: str) -> bytes:
                   for row in board.rows if row.cells["method"] == name]
     addresses = {(row.cells["environment"], row.cells["version"]): board.address
                  for board, row in placements}
-    versions: dict[str, list[dict[str, Any]]] = {}
-    for record in records:
-        versions.setdefault(record["version"], []).append(record)
+    versions: dict[tuple[str, str], list[dict[str, Any]]] = {}
+    for record in records:              # agents of several environments share name and version
+        key = record["version"], str(record["parameters"].get("env"))
+        versions.setdefault(key, []).append(record)
     table, axes = _placements(placements)
     return site.page(
         "method", "../", name=name, title=records[0]["title"], placements=table, axes=axes,
