@@ -16,7 +16,7 @@ _EYE = -np.linalg.qr(np.array([[0.30, 0.0, 1.0], [0.22, 1.0, 0.0], [0.9, -0.3, -
 
 
 def isosurface(mesh: Mesh, values: np.ndarray, level: float) -> np.ndarray:
-    """(k, 3, 3) corners in m of triangles on which linearly interpolated ``values`` are ``level``.
+    """Return triangles (k, 3, 3), corners in m, on which interpolated ``values`` are ``level``.
 
     A tetrahedron with one corner on either side of the level is cut in a triangle, a tetrahedron
     with two in a quadrilateral, given as two triangles.

@@ -249,7 +249,7 @@ def _newton(equations: _Equations, viscosity: float,
 
 def _linear_solution(equations: _Equations, viscosity: float,
                      around: np.ndarray | None) -> np.ndarray | None:
-    """Solve for x, linearised about ``around`` or rest (None); return None if it is singular."""
+    """Solve the equations linearised about ``around`` (None: rest); return None if singular."""
     basis = equations.basis
     free = equations.free
     viscous = viscosity * equations.laplace

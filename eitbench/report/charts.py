@@ -29,7 +29,7 @@ MAX_POINT_LABEL_CHARS = 36
 
 
 class Series(NamedTuple):
-    """One line."""
+    """Curve of a `line_chart`."""
 
     name: str
     colour: int
