@@ -294,9 +294,9 @@ def _table_options(table: Path) -> dict[str, Any]:
                          f"16' and 'current: 0.001' (A), got neither {table.name}.yml nor a "
                          f"{table.stem}.yml of a table in the folder of {table}")
     options = load_yaml(path, "table")
-    names = set(signature(read_table).parameters) - {"path"}
-    if not set(options) <= names:
-        raise ValueError(f"{path} must have entries of {', '.join(sorted(names))}, got {options!r}")
+    known = sorted(set(signature(read_table).parameters) - {"path"})
+    for name in options:
+        _check.choice(f"each entry of {path}", name, known)
     if missing := {"electrodes", "current"} - set(options):
         raise ValueError(f"{path} must have {', '.join(sorted(missing))}")
     return options
