@@ -1,12 +1,12 @@
 """One-step difference image with NOSER prior: one Newton step from the homogeneous estimate of each
 frame, under the assumption of a stationary target (Cheney et al. 1990).
 
-STRENGTH and POWER (`noser_prior`) were chosen as ALPHA of `gauss_newton`, by
+STRENGTH and POWER (`one_step`) were chosen as ALPHA of `gauss_newton`, by
 `studies/tune_reconstruction.py`.
 """
 
 from eitbench import Task
-from eitbench.estimation import FrameEstimator, noser_prior, one_step
+from eitbench.estimation import FrameEstimator, one_step
 
 STRENGTH = 0.25
 POWER = 0.5
@@ -17,6 +17,5 @@ class Estimator(FrameEstimator):
     parameters = {"strength": STRENGTH, "power": POWER}  # noqa: RUF012 (as a record has it)
 
     def __init__(self, task: Task) -> None:
-        prior = noser_prior(STRENGTH, POWER)
         super().__init__(task, lambda V, I, start: one_step(
-            task.observation, V, I, task.noise.std(V), prior, start))
+            task.observation, V, I, task.noise.std(V), STRENGTH, POWER, start))

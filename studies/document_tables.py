@@ -24,8 +24,10 @@ COLUMNS = {
     "Pipe3D": "3D", "Pipe3DSmoothing": "3D smoothing", "RotatingTank2D": "rotating",
     "StationaryTank2D": "stationary"}
 """Environment -> column of the table of estimators."""
-WITHOUT_FLOW = ("back_projection", "noser", "total_variation", "gauss_newton",
-                "random_walk_filter", "temporal_regularisation")
+WITHOUT_FLOW = {"back_projection": "BP", "noser": "NOSER", "total_variation": "TV",
+                "gauss_newton": "GN", "random_walk_filter": "walk",
+                "temporal_regularisation": "temporal"}
+"""Method without a flow model -> column of its table."""
 THESIS = ("kalman_filter", "fixed_lag_smoother", "fixed_interval_smoother")
 ASSUMPTIONS = {
     "homogeneous": ("–", "one constant"),
@@ -138,7 +140,8 @@ def methods() -> str:
     for id in COLUMNS:
         own = scores[scores["environment"] == id].set_index("method")
         best = own.loc[own["rank"].notna(), "error"].idxmin()
-        errors = {name.replace("_", " "): own["error"].get(name, np.nan) for name in WITHOUT_FLOW}
+        errors = {column: own["error"].get(name, np.nan)
+                  for name, column in WITHOUT_FLOW.items()}
         errors |= {"thesis": own["error"].reindex(THESIS).dropna().iloc[0],
                    "best": own["error"][best]}
         rows.append({"environment": id, **{name: number_cell(1e4 * error)

@@ -4,12 +4,11 @@ The rule: the smallest mean error on a grid, in filtering in the 2D pipe on trai
 15 minutes. Dev and test episodes are not used.
 """
 
-import importlib.util
 from itertools import product
 from pathlib import Path
-from types import ModuleType
 
 import eitbench
+from eitbench.bench.methods import load_module
 
 SEEDS = "train:0-1"
 BASELINES = Path(__file__).resolve().parent.parent / "baselines"
@@ -21,18 +20,10 @@ GRIDS: dict[str, dict[str, tuple[float, ...]]] = {
 """Method -> constant -> its values."""
 
 
-def load(name: str) -> ModuleType:
-    """Return the module of a built-in method."""
-    spec = importlib.util.spec_from_file_location(name, BASELINES / f"{name}.py")
-    assert spec is not None and spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
 def main() -> None:
     for name, grid in GRIDS.items():
-        module = load(name)
+        path = BASELINES / f"{name}.py"
+        module = load_module("method", path, path.read_bytes())
         errors = {}
         for values in product(*grid.values()):
             vars(module).update(zip(grid, values, strict=True))

@@ -204,13 +204,14 @@ class EstimatorOutput:
             points=truth_mesh(env.world).points, homogeneous=homogeneous,
             voltages_measured=self.voltages[states], voltages_predicted=computed,
             innovations=innovations, std=std, velocity=velocity,
-            solute_flow=_solute_flow(env, self.means[states], self.velocities[states]))
+            solute_flow=_solute_flow(env, truth, self.means[states], self.velocities[states]))
 
 
-def _solute_flow(env: EstimationEnv, means: np.ndarray, velocities: np.ndarray,
-                 ) -> tuple[np.ndarray, np.ndarray] | None:
-    """Return the estimated and the true flow of solute through the outlet (S,) in mol/s, for means
-    (S, n) and flow parameters (S, k) of the scored states; None without a flow through the vessel.
+def _solute_flow(env: EstimationEnv, states: np.ndarray, means: np.ndarray,
+                 velocities: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
+    """Return the estimated and the true flow of solute through the outlet (S,) in mol/s, for the
+    true ``states`` (S, n_truth) that are scored, their estimates (S, n) and flow parameters (S, k);
+    None without a flow through the vessel.
     """
     task, world = env.task, env.world
     model, truth = task.transport, cached_truth_model(world).transport
@@ -225,7 +226,7 @@ def _solute_flow(env: EstimationEnv, means: np.ndarray, velocities: np.ndarray,
     outlet = outlet_of(truth)
     first = task.warm_up + 1
     true = [outlet.solute_flow(concentration, drawn(t) if drawn else truth.velocity)
-            for t, concentration in enumerate(env.truth()[task.warm_up:], first)]
+            for t, concentration in enumerate(states, first)]
     return np.array(estimated), np.array(true)
 
 

@@ -32,7 +32,6 @@ from eitbench.estimation.forward import (
 from eitbench.estimation.gauss_newton import (
     StationaryMap,
     gauss_newton,
-    noser_prior,
     one_step,
     total_variation,
 )
@@ -98,7 +97,7 @@ __all__ = [
     "initial_hidden_state", "innovate", "kalman_filter", "linearise_at_prediction",
     "linearise_at_reference", "linearise_voltages", "load_network", "map_inflow",
     "maximise_posterior", "modal_states", "network_matches_task", "nodal_filter", "nodal_states",
-    "noser_prior", "one_step", "reduced_response", "scaled_velocity_prior", "smooth_means",
+    "one_step", "reduced_response", "scaled_velocity_prior", "smooth_means",
     "smooth_state", "smoothness_covariance", "steady_response", "table_5_1_filter",
     "task_velocity_prior", "time_varying_responses", "total_variation", "velocity_states",
 ]

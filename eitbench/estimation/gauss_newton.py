@@ -79,35 +79,24 @@ def gauss_newton(model: VoltageModel, voltages: np.ndarray, currents: np.ndarray
 
 
 def one_step(model: VoltageModel, voltages: np.ndarray, currents: np.ndarray,
-             noise_std: np.ndarray, prior: Callable[[np.ndarray], np.ndarray],
+             noise_std: np.ndarray, strength: float, power: float,
              start: np.ndarray) -> np.ndarray:
     """Return a linear difference image: start + argmin_x ‖(V − U(start) − J x)/std‖² + xᵀ Γ⁻¹ x.
 
-    Arguments as in `gauss_newton`; ``prior`` maps A = J/std (m, n) of the measured voltages to
-    Γ Aᵀ (n, m).
+    Arguments as in `gauss_newton`. With A = J/std of the measured voltages the prior is
+    Γ = diag(AᵀA)^-power / strength²: power 1 is NOSER (Cheney et al. 1990), 0 Tikhonov, 1/2 a usual
+    compromise (EIDORS). Nodes of less than a millionth of the largest sensitivity have that
+    variance.
     """
     computed, jacobian = model.linearise(start, currents)
     measured = np.isfinite(voltages)
     weight = 1.0 / noise_std[measured]
     A = jacobian[measured] * weight[:, None]
-    cross = prior(A)
+    squares = (A**2).sum(axis=0)
+    cross = A.T / (strength**2 * np.maximum(squares, 1e-6 * squares.max())**power)[:, None]
     residual = (voltages - computed)[measured] * weight
     solution: np.ndarray = cross @ cho_solve(cho_factor(A @ cross + np.eye(len(A))), residual)
     return start + solution
-
-
-def noser_prior(strength: float, power: float) -> Callable[[np.ndarray], np.ndarray]:
-    """Return the prior Γ = diag(AᵀA)^-power / strength² of `one_step`, for a strength > 0.
-
-    power = 1 is NOSER (Cheney et al. 1990), 0 Tikhonov, 1/2 a usual compromise (EIDORS). Nodes of
-    less than a millionth of the largest sensitivity have that variance.
-    """
-    def prior(A: np.ndarray) -> np.ndarray:
-        squares = (A**2).sum(axis=0)
-        scaled = np.maximum(squares, 1e-6 * squares.max())**power
-        return A.T / (strength**2 * scaled)[:, None]
-
-    return prior
 
 
 def total_variation(model: VoltageModel, voltages: np.ndarray, currents: np.ndarray,

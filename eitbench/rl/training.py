@@ -165,10 +165,12 @@ def train(env: str, algo: str, config: TrainingConfig, seed: int, folder: Path,
              "config": asdict(config)}
     settings, made, latest = (folder / name for name in ("config.json", "model.zip", "latest.zip"))
     if settings.exists():
-        there, here = (each | each["config"] for each in (
+        there, here = (each | each.get("config", {}) for each in (
             json.loads(settings.read_text()), json.loads(json.dumps(asked))))
-        if differ := [name for name in here if name != "config" and there[name] != here[name]]:
-            found = ", ".join(f"{name} {there[name]}, not {here[name]}" for name in differ)
+        if differ := [name for name in here if name != "config"
+                      and there.get(name, "unknown") != here[name]]:
+            found = ", ".join(f"{name} {there.get(name, 'unknown')}, not {here[name]}"
+                              for name in differ)
             raise ValueError(f"out must be empty, or of the same run; {folder} has {found}")
     if made.exists() and (folder / "sha256").exists() and not latest.exists():
         return made

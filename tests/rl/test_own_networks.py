@@ -13,6 +13,7 @@ from eitbench.bench.store import EpisodeStore
 from eitbench.bench.submit import submit
 from eitbench.data.seeds import parse_seeds
 from eitbench.rl import save_agent
+from eitbench.rl.training import TrainingConfig, train
 from sb3_contrib import TRPO
 from stable_baselines3 import PPO
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
@@ -115,6 +116,8 @@ def test_names_of_saved_agents(tmp_path):
              for folder, seed in (("mine_0", 0), ("mine_1", 1), ("other", 0))]
     first, second, other = (name.rpartition("_seed") for name in names)
     assert first[0] == second[0] != other[0] and (first[2], second[2], other[2]) == ("0", "1", "0")
+    with pytest.raises(ValueError, match=r"out must be empty, or of the same run; .* unknown, not"):
+        train(NAME, "ppo", TrainingConfig(total_steps=1), 0, tmp_path / "mine_0", SHORT)
 
 
 def test_what_is_no_agent_is_refused(tmp_path):
