@@ -5,20 +5,17 @@ from typing import Any
 
 import numpy as np
 
-from eitbench.estimation.onboard.belief import Belief
+from eitbench.estimation.onboard.belief import Belief, BodyBelief, create_or_update
 from eitbench.estimation.onboard.rules import Rules
 
 
 class Policy:
     def __init__(self, rules: Rules, random: np.random.Generator) -> None:
         self.rules = rules
-        self.belief: Belief | None = None
+        self.belief: Belief | BodyBelief | None = None
 
     def act(self, observation: dict[str, np.ndarray]) -> Any:
-        self.belief = Belief.create_or_update(self.belief, self.rules, observation)
+        self.belief = create_or_update(self.belief, self.rules, observation)
         if not self.rules.is_injection_step(observation["left"]):
             return self.rules.action(None)
-        belief = self.belief
-        criterion = belief.design_criteria(belief.predict_covariance(),
-                                           jacobian=belief.relinearised_jacobian())[0]
-        return self.rules.action(int(criterion.argmax()))
+        return self.rules.action(int(self.belief.criteria()[0].argmax()))

@@ -246,9 +246,10 @@ class InjectionCore(EpisodeCore):
 
     def observe(self) -> Observation:
         """Return raw observations (B, …): the last measurement and features of the estimate."""
-        shown = {"voltages": self._voltages.copy(), "currents": self.currents.copy()}
+        # zero where the instrument does not measure
+        shown = {"voltages": np.nan_to_num(self._voltages), "currents": self.currents.copy()}
         if self._filters_type:
-            shown |= {"recent": self._recent.copy(), "frame": self._frames.copy()}
+            shown |= {"recent": self._recent.copy(), "frame": np.nan_to_num(self._frames)}
             shown |= self._onboard.features()
         left = [np.full(len(self.n_injections), float(self.world.n_steps - self.t))]
         if self.rules.budget is not None:

@@ -1,10 +1,12 @@
-"""Bodies in a round tank: a resistive disc in the flow, and stationary metal cylinders."""
+"""Bodies in a round tank: a resistive disc in the flow, one that moves by itself, and stationary
+metal cylinders."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -92,6 +94,96 @@ class ResistiveDisc(Target):
             yield TruthTrajectory(concentration, np.empty((last, 0)))
 
 
+class BodyPath(NamedTuple):
+    """Path of a body in an episode, t = 0 … T."""
+
+    centres: np.ndarray
+    """(T + 1, 2) m"""
+    present: np.ndarray
+    """(T + 1,) bool: whether the body is in the tank"""
+    radius: float
+    """m"""
+
+
+@dataclass(frozen=True)
+class WanderingBody(Target):
+    """A resistive disc that moves by itself in a liquid at rest. All numbers [E].
+
+    It runs straight ahead and turns into a random direction, and to a random speed, at random
+    times; the wall reflects it. With visits it disappears at random times and returns anywhere.
+    """
+
+    background: float = 30.0
+    """mol/m³, about 0.3 S/m: weak saline"""
+    radius_range: tuple[float, float] = (0.014, 0.018)
+    """m"""
+    concentration: float = 1.5
+    """mol/m³: a twentieth of the background, because a P1 conductivity has to stay positive"""
+    speed_range: tuple[float, float] = (0.1, 0.3)
+    """m/s"""
+    run_time: float = 0.4
+    """s, mean of the exponentially distributed times between turns"""
+    visit_time: float = math.inf
+    """s, mean time that the body is present"""
+    absence_time: float = 0.5
+    """s, mean time that it is absent"""
+
+    is_advected = False
+
+    def __post_init__(self) -> None:
+        check_positive(self, background="mol/m³", concentration="mol/m³", run_time="s",
+                       absence_time="s")
+        check_range(self, "radius_range", "m")
+        check_range(self, "speed_range", "m/s")
+        if self.visit_time != math.inf:
+            check_positive(self, visit_time="s")
+
+    def check(self, world: World) -> None:
+        """Raise ``ValueError`` if the body does not fit into the vessel."""
+        if not self.radius_range[1] < 0.5 * getattr(world.vessel, "radius", 0.0):
+            raise ValueError("target.radius_range must end below half of the radius of a round "
+                             f"tank, got {self.radius_range!r} in a {type(world.vessel).__name__}")
+
+    def path(self, world: World, random: np.random.Generator) -> BodyPath:
+        """Draw the path of an episode."""
+        radius = random.uniform(*self.radius_range)
+        limit = world.vessel.radius - radius
+        dt = world.time_step
+        centres, present = [], []
+        is_present = True
+        centre, velocity = self._place(random, limit), self._velocity(random)
+        for _ in range(world.n_steps + 1):
+            centres.append(centre)
+            present.append(is_present)
+            if random.uniform() < -math.expm1(-dt / self.run_time):
+                velocity = self._velocity(random)
+            centre, velocity = reflect(centre + dt * velocity, velocity, limit)
+            stay = self.visit_time if is_present else self.absence_time
+            if random.uniform() < -math.expm1(-dt / stay):
+                is_present = not is_present
+                if is_present:
+                    centre, velocity = self._place(random, limit), self._velocity(random)
+        return BodyPath(np.array(centres), np.array(present), radius)
+
+    def _place(self, random: np.random.Generator, limit: float) -> np.ndarray:
+        return limit * math.sqrt(random.uniform()) * _direction(random)
+
+    def _velocity(self, random: np.random.Generator) -> np.ndarray:
+        return random.uniform(*self.speed_range) * _direction(random)
+
+    def evolve(self, world: World, episodes: Sequence[EpisodeStreams], truth: Discretisation,
+               tick: Callable[[int], object], last: int) -> Iterator[TruthTrajectory]:
+        points = truth.transport.mesh.points
+        for episode in episodes:
+            path = self.path(world, episode.flow)
+            disc = np.array([present * disc_indicator(points, centre, path.radius, TRANSITION_WIDTH)
+                             for centre, present in zip(path.centres[:last + 1], path.present,
+                                                        strict=False)])
+            tick(world.n_steps)
+            concentration = self.background + (self.concentration - self.background) * disc
+            yield TruthTrajectory(concentration, np.empty((last, 0)))
+
+
 @dataclass(frozen=True)
 class Cylinders(Target):
     """Two stationary metal cylinders, drawn for each episode (thesis 7.2, Fig. 7.4)."""
@@ -159,6 +251,24 @@ class Cylinders(Target):
             tick(world.n_steps)
             states = np.repeat(concentration[None], last + 1, axis=0)
             yield TruthTrajectory(states, np.empty((last, 0)))
+
+
+def reflect(centres: np.ndarray, velocities: np.ndarray,
+            limit: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return centres (..., 2) in m, and their velocities, after reflection at the circle of radius
+    ``limit`` in m."""
+    distance = np.hypot(centres[..., 0], centres[..., 1])[..., None]
+    normal = centres / np.maximum(distance, 1e-12)
+    outward = (velocities * normal).sum(axis=-1, keepdims=True)
+    outside = distance > limit
+    reflected = normal * np.maximum(2.0 * limit - distance, 0.0)
+    return (np.where(outside, reflected, centres),
+            np.where(outside & (outward > 0.0), velocities - 2.0 * outward * normal, velocities))
+
+
+def _direction(random: np.random.Generator) -> np.ndarray:
+    angle = random.uniform(0.0, 2.0 * np.pi)
+    return np.array([np.cos(angle), np.sin(angle)])
 
 
 def disc_indicator(points: np.ndarray, centre: np.ndarray, radius: float,

@@ -13,6 +13,8 @@ from eitbench.worlds.fields import ADDED_LATER, check_positive, check_range
 
 CURRENT_NORMS = ("L1", "L2", "Linf")
 """Norms that may bound the currents."""
+READINGS = ("all", "neighbours")
+"""Electrodes whose voltages are measured: all, or the two next to each driven one."""
 
 
 class Faults(NamedTuple):
@@ -71,6 +73,9 @@ class Instrument:
     contact_impedance_spread: float = field(default=0.0, metadata=ADDED_LATER)
     """half range of each electrode's contact impedance, relative to the value in the task; drawn
     uniformly for each episode"""
+    readings: str = field(default="all", metadata=ADDED_LATER)
+    """electrodes that are measured in an injection, one of `READINGS`. "neighbours": a serial
+    instrument with few voltmeters, whose other voltages are NaN; electrode L − 1 is next to 0"""
 
     def __post_init__(self) -> None:
         check_positive(self, current="A")
@@ -80,6 +85,7 @@ class Instrument:
             _check.number(name, getattr(self, name), low=0.0, units=units)
         if self.current_norm is not None:
             _check.choice("current_norm", self.current_norm, CURRENT_NORMS)
+        _check.choice("readings", self.readings, READINGS)
         _check.number("loose_noise", self.loose_noise, low=1.0)
         _check.number("noise_mismatch", self.noise_mismatch, low=0.0)
         _check.number("contact_impedance_spread", self.contact_impedance_spread, low=0.0, high=0.95)
@@ -145,4 +151,12 @@ class Instrument:
         clean = (transfer_resistance @ driven[..., None])[..., 0] + faults.resistance * driven
         std = np.hypot(self.noise.std(clean) * faults.noise_factor, self.noise_floor)
         std = self.noise_mismatch * std
-        return np.where(broken, self.interference * draws, clean + std * draws)
+        voltages = np.where(broken, self.interference * draws, clean + std * draws)
+        return np.where(self.measured(currents), voltages, np.nan)
+
+    def measured(self, currents: np.ndarray) -> np.ndarray:
+        """Return the mask (..., L) of the electrodes that are measured for currents (..., L)."""
+        if self.readings == "all":
+            return np.ones(currents.shape, dtype=bool)
+        driven = currents != 0.0
+        return (np.roll(driven, 1, axis=-1) | np.roll(driven, -1, axis=-1)) & ~driven

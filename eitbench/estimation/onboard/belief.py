@@ -9,6 +9,7 @@ import numpy as np
 
 from eitbench.data.episode_cache import scoring_constants
 from eitbench.estimation.design import pair_design_criteria
+from eitbench.estimation.onboard.body_belief import BodyBelief
 from eitbench.estimation.onboard.linearisation import linearisation_table
 from eitbench.estimation.onboard.reduced_filters import ReducedFilters
 
@@ -189,6 +190,12 @@ class Belief:
             criteria = criteria[0] * usable, criteria[1] * usable
         return criteria
 
+    def criteria(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return the A- and D-criterion of each pair, (pairs,) each, of the next injection,
+        linearised about the estimate."""
+        return self.design_criteria(self.predict_covariance(),
+                                    jacobian=self.relinearised_jacobian())
+
     def posterior_covariance(self, covariance: np.ndarray, pair: int,
                              healthy: np.ndarray | None = None) -> np.ndarray:
         """Return the covariance (s, s) after an injection through this pair."""
@@ -269,6 +276,16 @@ class Belief:
     @property
     def _noise_variance(self) -> np.ndarray:
         return _noise_variance(self.rules, self.linearisation.resistance.tobytes())
+
+
+def create_or_update(belief: Belief | BodyBelief | None, rules: Rules,
+                     observation: dict[str, np.ndarray]) -> Belief | BodyBelief:
+    """Return the belief for these rules after an observation: a new one, if None, or the updated
+    one."""
+    if belief is None:
+        return (BodyBelief if rules.tracks_body else Belief)(rules, observation)
+    belief.update(observation)
+    return belief
 
 
 @lru_cache(maxsize=64)

@@ -50,11 +50,15 @@ class EpisodeFilters(Protocol):
     def __init__(self, rules: Rules, frames: np.ndarray) -> None:
         self._rules = rules
         self.table = linearisation_table(rules.world)
-        self.indices = self.table.nearest_indices(frames, rules.gate)
+        self.indices = self._reference_indices(frames)
         self.c_ref = np.array([self.table.c_ref(k) for k in self.indices])
         self._start(len(frames))
         for k, currents in enumerate(rules.world.currents):
             self.assimilate(frames[:, k], np.repeat(currents[None], len(frames), axis=0))
+
+    def _reference_indices(self, frames: np.ndarray) -> list[int]:
+        """Return the index of c_ref of each episode in the table, from the first frame."""
+        return self.table.nearest_indices(frames, self._rules.gate)
 
     def _start(self, episodes: int) -> None:
         """Create the filters at t = 0."""

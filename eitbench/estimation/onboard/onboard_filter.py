@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from eitbench import _check
+from eitbench.estimation.onboard.body_filters import BodyFilters, FullBodyFilters
 from eitbench.estimation.onboard.episode_filters import EpisodeFilters
 from eitbench.estimation.onboard.full_filters import FullFilters
 from eitbench.estimation.onboard.reduced_filters import ReducedFilters
@@ -33,6 +34,8 @@ def filters_class(rules: Rules, estimator: str) -> type[EpisodeFilters] | None:
         if rules.world.velocity_model is not None:
             raise ValueError("inflow must be 'white' where the velocity is estimated too, "
                              f"got {rules.inflow!r}")
+    if rules.tracks_body:
+        return BodyFilters if estimator == "reduced" else FullBodyFilters
     return ReducedFilters if estimator == "reduced" else FullFilters
 
 

@@ -10,6 +10,7 @@ from gymnasium import spaces
 
 from eitbench import _check
 from eitbench.estimation.onboard.linearisation import electrode_pairs, pair_currents
+from eitbench.worlds.bodies import WanderingBody
 
 if TYPE_CHECKING:
     from eitbench.worlds.instrument import Instrument
@@ -65,6 +66,11 @@ class Rules:
     def budget(self) -> int | None:
         """Injections that the agent may make, or None: it injects at every step."""
         return self.world.schedule.budget
+
+    @property
+    def tracks_body(self) -> bool:
+        """True if the filter inside estimates the position of a body, not a concentration."""
+        return isinstance(self.world.target, WanderingBody)
 
     @property
     def pairs(self) -> np.ndarray:

@@ -1,0 +1,40 @@
+"""True position: greedy, A-optimal, with the uncertainty of the filter about the true position of a
+body, an oracle.
+
+It shows what knowing where to look is worth: it knows the position, but the filter learns only from
+the injections that it makes.
+"""
+
+from typing import Any
+
+import numpy as np
+
+from eitbench.envs.injection_core import InjectionCore
+from eitbench.estimation.onboard.belief import BodyBelief
+from eitbench.estimation.onboard.rules import Rules
+from eitbench.worlds.random_streams import episode_streams
+
+
+class Policy:
+    privileged = True
+    role = "reference"
+
+    @classmethod
+    def suits(cls, rules: Rules) -> bool:
+        return rules.tracks_body
+
+    def __init__(self, rules: Rules, random: np.random.Generator, core: InjectionCore) -> None:
+        self.rules = rules
+        self.core = core
+        self.belief: BodyBelief | None = None
+        streams = episode_streams(core.seeds[0])
+        self.path = rules.world.target.path(rules.world, streams.flow)
+
+    def act(self, observation: dict[str, np.ndarray]) -> Any:
+        if self.belief is None:
+            self.belief = BodyBelief(self.rules, observation)
+        else:
+            self.belief.update(observation)
+        next_state = self.core.t + 1
+        criterion = self.belief.criteria(self.path.centres[next_state])[0]
+        return self.rules.action(int(criterion.argmax()))

@@ -1,0 +1,66 @@
+"""Belief of an injection policy about a body: the particle filter inside the environment."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from eitbench.estimation.onboard.body_filters import MODEL_ERROR, BodyFilters, measured_first
+from eitbench.worlds.bodies import reflect
+
+if TYPE_CHECKING:
+    from eitbench.estimation.onboard.rules import Rules
+
+
+class BodyBelief:
+    """Particles of the environment's filter, and the design criteria of each injection.
+
+    It is created from the first raw observation of an episode and updated with every later one.
+    """
+
+    def __init__(self, rules: Rules, observation: dict[str, np.ndarray]) -> None:
+        self.rules = rules
+        self._filters = BodyFilters(rules, observation["frame"][None])
+        model = self._filters.model
+        L = len(model.resistance)
+        pair_currents = rules.action_currents[:len(rules.pairs)]
+        electrodes, self._measured = measured_first(rules.instrument.measured(pair_currents))
+        std = model.table.noise_std(pair_currents @ model.resistance, rules.instrument.noise_floor)
+        self._variance = np.take_along_axis(std**2, electrodes, axis=1)
+        source, sink = rules.pairs.T[:, :, None]
+        self._from, self._to = electrodes * L + source, electrodes * L + sink
+
+    def update(self, observation: dict[str, np.ndarray]) -> None:
+        """Assimilate the outcome of the last injection."""
+        self._filters.assimilate(observation["voltages"][None], observation["currents"][None])
+
+    def criteria(self, centre: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
+        """Return the A- and D-criterion of each pair, (pairs,) each, of the next injection.
+
+        They treat particles and voltages as jointly Gaussian: the decrease of the expected squared
+        error of the image on the coarse grid, and half of the decrease of the log-determinant of
+        the voltages' covariance. For oracles, ``centre`` (2,) in m is the mean to which the
+        predicted particles are moved.
+        """
+        model = self._filters.model
+        weights = self._filters.weights[0]
+        # other random numbers than those of the filter's next step, which are not known
+        particles = model.move(self._filters.particles, np.random.default_rng(1))
+        if centre is not None:
+            moved = particles.centres + centre - weights @ particles.centres[0]
+            particles = particles._replace(centres=reflect(moved, moved, model.limit)[0])
+        index, share = (each[:, 0] for each in model.cells(particles))
+        images = np.einsum("kp,kpm->pm", share, model.patches.T[index])
+        P, n_pairs = len(weights), len(self.rules.pairs)
+        signals = np.einsum("kp,ekp->pe", self.rules.amplitude * share, model.signals[:, index])
+        predicted = np.moveaxis(signals[:, self._from] - signals[:, self._to], 0, 1)
+        mean = weights @ predicted
+        root = self._measured / np.sqrt(self._variance + MODEL_ERROR**2 * (weights @ predicted**2))
+        scaled = (predicted - mean[:, None]) * root[:, None]
+        weighted = np.swapaxes(weights[:, None] * scaled, 1, 2)
+        S = weighted @ scaled + np.eye(scaled.shape[2])
+        cross = (weighted.reshape(-1, P) @ (images - weights @ images)).reshape(
+            n_pairs, -1, images.shape[1])
+        gains = (cross * np.linalg.solve(S, cross)).sum(axis=(1, 2))
+        return gains, 0.5 * np.linalg.slogdet(S)[1]

@@ -1,0 +1,274 @@
+"""Particle filters of the position of a body in a round tank, for batches of episodes."""
+
+from __future__ import annotations
+
+import math
+from functools import lru_cache
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+import scipy.sparse as sp
+
+from eitbench.data.episode_cache import score_mass, step_error
+from eitbench.estimation.onboard.episode_filters import EpisodeFilters, Innovation
+from eitbench.estimation.onboard.linearisation import linearisation_table, std_from_variance
+from eitbench.worlds.bodies import TRANSITION_WIDTH, WanderingBody, disc_indicator, reflect
+
+if TYPE_CHECKING:
+    from eitbench.estimation.onboard.rules import Rules
+    from eitbench.worlds.world import World
+
+SPACING = 5e-3
+"""m, spacing of the grid on which signals and images of a body are tabulated."""
+MODEL_ERROR = 0.05
+"""Standard deviation of the error of a body's signal, relative to the signal."""
+POSITION_JITTER = 1e-3
+"""m, standard deviation of the movement of a resampled particle."""
+AREA_WALK = 0.02
+"""Standard deviation per step of the logarithm of a particle's area."""
+PARTICLES = 512
+FULL_PARTICLES = 2048
+
+
+class Particles(NamedTuple):
+    """Particles of B episodes."""
+
+    centres: np.ndarray
+    """(B, P, 2) m"""
+    velocities: np.ndarray
+    """(B, P, 2) m/s"""
+    areas: np.ndarray
+    """(B, P) area of the body relative to the mean one"""
+    present: np.ndarray
+    """(B, P) bool: whether the body is in the tank"""
+
+
+class BodyModel:
+    """Motion, signals and images of a body, shared by all episodes of a world.
+
+    The signal of a disc is the linearised one times the ratio 2/(1 + k) of an exact and a
+    linearised dipole, with k the ratio of the conductivities, and proportional to its area: in the
+    tank within 5 % of the complete electrode model up to 1.5 radii from the wall. The motion is an
+    Ornstein–Uhlenbeck velocity with the speed and the run time of the target.
+    """
+
+    def __init__(self, world: World) -> None:
+        target: WanderingBody = world.target
+        self.world, self.target = world, target
+        self.table = linearisation_table(world)
+        points = self.table.task.mesh.points
+        self.radius = float(np.mean(target.radius_range))
+        self.limit = world.vessel.radius - self.radius
+        self.side = 2 * math.ceil(self.limit / SPACING) + 1
+        """grid points along x and y"""
+        axis = SPACING * (np.arange(self.side) - self.side // 2)
+        grid = np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2)
+        grid, _ = reflect(grid, grid, self.limit)
+        discs = np.array([disc_indicator(points, centre, self.radius, TRANSITION_WIDTH)
+                          for centre in grid])
+        contrast = target.concentration / target.background - 1.0
+        reference = self.table.linearisation(0)
+        self.resistance = reference.resistance
+        L = len(self.resistance)
+        dipole = 2.0 * contrast / (2.0 + contrast)
+        self.signals = dipole * (reference.jacobian.reshape(L * L, -1) @ discs.T)
+        """(L², G) change of 𝓡 by a disc at each grid point"""
+        discs[discs < 1e-3] = 0.0
+        self.images = sp.csr_array((contrast * target.background * discs).T)
+        """(n, G) change of the concentration by a disc at each grid point in mol/m³"""
+        self.patches = (self.table.grid_averages @ self.images)
+        """(patches, G) the same on the coarse grid"""
+        low, high = target.speed_range
+        self.speed = math.sqrt((low**2 + low * high + high**2) / 6.0)
+        """m/s, standard deviation of each component of the velocity"""
+        self.decay = math.exp(-world.time_step / target.run_time)
+        self.log_area_std = (math.log(target.radius_range[1] / target.radius_range[0])
+                             / math.sqrt(3.0))
+        self.leave, self.enter = (-math.expm1(-world.time_step / time)
+                                  for time in (target.visit_time, target.absence_time))
+
+    def draw(self, random: np.random.Generator, count: int) -> tuple[np.ndarray, ...]:
+        """Draw centres, velocities and areas of new particles, (count, …)."""
+        angle = random.uniform(0.0, 2.0 * np.pi, count)
+        distance = self.limit * np.sqrt(random.uniform(size=count))
+        return (np.stack([distance * np.cos(angle), distance * np.sin(angle)], axis=1),
+                self.speed * random.standard_normal((count, 2)),
+                np.exp(self.log_area_std * random.standard_normal(count)))
+
+    def move(self, particles: Particles, random: np.random.Generator) -> Particles:
+        """Move particles by a time step, with the same random numbers in all episodes."""
+        centres, velocities, areas, present = particles
+        B, P = areas.shape
+        noise = random.standard_normal((P, 3))
+        velocities = (self.decay * velocities
+                      + math.sqrt(1.0 - self.decay**2) * self.speed * noise[:, :2])
+        areas = areas * np.exp(AREA_WALK * noise[:, 2])
+        centres, velocities = reflect(centres + self.world.time_step * velocities, velocities,
+                                      self.limit)
+        if self.leave > 0.0:
+            draw = random.uniform(size=P)
+            entering = ~present & (draw < self.enter)
+            new = self.draw(random, P)
+            centres, velocities, areas = (
+                np.where(entering.reshape(B, P, *(1,) * (old.ndim - 2)), each, old)
+                for old, each in zip((centres, velocities, areas), new, strict=True))
+            present = np.where(present, draw >= self.leave, entering)
+        return Particles(centres, velocities, areas, present)
+
+    def cells(self, particles: Particles) -> tuple[np.ndarray, np.ndarray]:
+        """Return the grid points (4, B, P) around each particle, and their bilinear weights, times
+        the area; zero for absent ones."""
+        position = particles.centres / SPACING + self.side // 2
+        corner = np.clip(position.astype(int), 0, self.side - 2)
+        x, y = np.moveaxis(position - corner, -1, 0)
+        first = corner[..., 1] * self.side + corner[..., 0]
+        weights = np.stack([(1 - x) * (1 - y), x * (1 - y), (1 - x) * y, x * y])
+        index = np.stack([first, first + 1, first + self.side, first + self.side + 1])
+        return index, weights * (particles.areas * particles.present)
+
+
+class BodyFilters(EpisodeFilters):
+    """Particle filters of B episodes: bootstrap proposals, systematic resampling.
+
+    The concentration of the liquid is known. Random numbers are the same in all episodes.
+    """
+
+    n_particles = PARTICLES
+
+    def _reference_indices(self, frames: np.ndarray) -> list[int]:
+        return [0] * len(frames)
+
+    def _start(self, episodes: int) -> None:
+        self.model = body_model(self._rules.world.fault_free)
+        self._random = np.random.default_rng(0)
+        P = self.n_particles
+        new = self.model.draw(self._random, P)
+        self.particles = Particles(*(np.repeat(each[None], episodes, axis=0) for each in new),
+                                   np.ones((episodes, P), dtype=bool))
+        self.weights = np.full((episodes, P), 1.0 / P)
+        self._density: np.ndarray | None = None
+
+    def assimilate(self, voltages: np.ndarray,
+                   currents: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        model = self.model
+        self.particles = model.move(self.particles, self._random)
+        self._cells = model.cells(self.particles)
+        measured = self._rules.instrument.measured(currents) & currents.any(axis=1, keepdims=True)
+        electrodes, used = measured_first(measured)
+        base = currents @ model.resistance
+        std = self.table.noise_std(base, self._rules.instrument.noise_floor)
+        std, residual = (np.take_along_axis(each, electrodes, axis=1)[:, None]
+                         for each in (std, voltages - base))
+        signal = self._signals(currents, electrodes)                            # (B, P, m)
+        variance = std**2 + (MODEL_ERROR * signal)**2
+        residual = np.where(used[:, None], residual - signal, 0.0)
+        variance = np.where(used[:, None], variance, 1.0)
+        self._last = *self._innovation(residual, variance), used
+        self._reweight(-0.5 * (residual**2 / variance + np.log(variance)).sum(axis=2))
+        innovation, S, _ = self._last
+        scaled = np.zeros(voltages.shape)
+        np.put_along_axis(scaled, electrodes, innovation / np.sqrt(
+            S.diagonal(axis1=1, axis2=2)), axis=1)
+        return scaled, np.ones(measured.shape, dtype=bool)
+
+    def _signals(self, currents: np.ndarray, electrodes: np.ndarray) -> np.ndarray:
+        """Return the signals (B, P, m) in V of the particles at electrodes (B, m) for currents
+        (B, L)."""
+        index, weights = self._cells
+        L = currents.shape[1]
+        found = np.zeros((*self.weights.shape, electrodes.shape[1]))
+        for b in np.flatnonzero(currents.any(axis=1)):
+            current = currents[b]
+            table = sum(current[d] * self.model.signals[electrodes[b] * L + d]
+                        for d in np.flatnonzero(current))
+            found[b] = np.einsum("kp,mkp->pm", weights[:, b], table[:, index[:, b]])
+        return found
+
+    def _innovation(self, residual: np.ndarray,
+                    variance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return mean (B, m) and covariance (B, m, m) of the predicted residuals."""
+        weights = self.weights[..., None]
+        mean = (weights * residual).sum(axis=1)
+        deviation = residual - mean[:, None]
+        S = np.swapaxes(deviation, 1, 2) @ (weights * deviation)
+        S += (weights * variance).sum(axis=1)[:, None] * np.eye(residual.shape[2])
+        return mean, S
+
+    def _reweight(self, log_likelihood: np.ndarray) -> None:
+        log_weights = np.log(np.maximum(self.weights, 1e-300)) + log_likelihood
+        weights = np.exp(log_weights - log_weights.max(axis=1, keepdims=True))
+        self.weights = weights / weights.sum(axis=1, keepdims=True)
+        self._density = None
+        P = self.n_particles
+        offset = self._random.uniform()
+        jitter = POSITION_JITTER * self._random.standard_normal((P, 2))
+        for b in np.flatnonzero((self.weights**2).sum(axis=1) * P > 2.0):
+            chosen = np.searchsorted(self.weights[b].cumsum(), (np.arange(P) + offset) / P)
+            chosen = np.minimum(chosen, P - 1)
+            for each in self.particles:
+                each[b] = each[b, chosen]
+            self.particles.centres[b] += jitter
+            self.weights[b] = 1.0 / P
+
+    def _densities(self) -> np.ndarray:
+        """Return the posterior means (2, B, G) on the grid of a body's area, and of its square."""
+        index, weights = self.model.cells(self.particles)
+        B, G = len(self.weights), self.model.signals.shape[1]
+        flat = (index + G * np.arange(B)[:, None]).ravel()
+        return np.array([
+            np.bincount(flat, (weights * self.weights * factor).ravel(), B * G).reshape(B, G)
+            for factor in (1.0, self.particles.areas)])
+
+    def innovations(self) -> list[Innovation | None]:
+        return [Innovation.of(*each) for each in zip(*self._last, strict=True)]
+
+    def _moments(self, images: sp.csr_array) -> tuple[np.ndarray, np.ndarray]:
+        """Return mean and standard deviation (B, m) of functionals of the body."""
+        if self._density is None:
+            self._density = self._densities()
+        first, second = self._density
+        mean = (images @ first.T).T
+        return mean, std_from_variance((images**2 @ second.T).T - mean**2)
+
+    def coarse_grid(self) -> tuple[np.ndarray, np.ndarray]:
+        mean, std = self._moments(self.model.patches)
+        return self.c_ref[:, None] + mean, std
+
+    def errors(self, moments: np.ndarray, deviations: np.ndarray,
+               squares: np.ndarray) -> np.ndarray:
+        world = self._rules.world
+        return step_error(score_mass(world), self.means() - world.background, moments, deviations,
+                          squares)
+
+    def means(self) -> np.ndarray:
+        return self.c_ref[:, None] + self._moments(self.model.images)[0]
+
+    def stds(self) -> np.ndarray:
+        return self._moments(self.model.images)[1]
+
+    def velocity(self) -> None:
+        return None
+
+    @staticmethod
+    def project(rules: Rules, moment: np.ndarray) -> np.ndarray:
+        return np.asarray(moment)
+
+
+def measured_first(measured: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return electrodes (B, m) that contain the measured ones of a mask (B, L), with m as small as
+    possible, and their mask (B, m)."""
+    m = max(1, measured.sum(axis=1).max())
+    electrodes = np.argsort(~measured, axis=1, kind="stable")[:, :m]
+    return electrodes, np.take_along_axis(measured, electrodes, axis=1)
+
+
+class FullBodyFilters(BodyFilters):
+    """The same with more particles, for scored runs."""
+
+    n_particles = FULL_PARTICLES
+
+
+@lru_cache(maxsize=4)
+def body_model(world: World) -> BodyModel:
+    """Return the model of a world's body, built once per process."""
+    return BodyModel(world)
