@@ -3,7 +3,8 @@
 The criterion is the mean reward on the first training episodes with the reduced filter; a budget is
 used at equal intervals. First each pair is injected constantly. Then a cycle of the twelve best
 pairs grows by the best pair while the criterion improves, to four pairs at most. Then coordinate
-search replaces each pair of the cycle until convergence. In environments with a separate current
+search replaces each pair of the cycle until convergence. In a round tank, pairs that rotate around
+it are tried too. In environments with a separate current
 for each electrode, coordinate search over -1, -1/2, 0, 1/2 and 1 starts from the best pair, from
 the first half of the electrodes against the second, and from random signs. Dev and test episodes
 are not used. The results are in `baselines/injection/best_pair.py`, `best_cycle.py` and
@@ -24,6 +25,7 @@ from tqdm import tqdm
 from eitbench.data.seeds import SPLITS
 from eitbench.envs.injection import InjectionVectorEnv
 from eitbench.worlds import entries
+from eitbench.worlds.vessels import RoundTank
 
 N_BEST_PAIRS = 12
 MAX_CYCLE_LENGTH = 4
@@ -82,6 +84,8 @@ def main() -> None:
     for pair in best:
         print(f"    {pairs[pair].tolist()}: {search([pair]):.6f}")
     (search_currents if search.env.rules.limit else search_cycle)(search, best)
+    if isinstance(search.env.world.vessel, RoundTank):
+        search_rotation(search)
 
 
 def search_currents(search: Search, best: Sequence[int]) -> None:
@@ -125,6 +129,16 @@ def search_cycle(search: Search, best: Sequence[int]) -> None:
             cycle = max(([*cycle[:k], pair, *cycle[k + 1:]] for pair in [cycle[k], *best]),
                         key=search)
     report("cycle", search, pairs, cycle)
+
+
+def search_rotation(search: Search) -> None:
+    """Search for the best cycle in which a pair rotates around a tank."""
+    pairs = search.env.rules.pairs.tolist()
+    L = search.env.world.vessel.n_electrodes
+    rotations = [[pairs.index(sorted(((k * step) % L, (k * step + span) % L))) for k in range(L)]
+                 for step in range(1, L // 2, 2) for span in range(1, L // 2 + 1)]
+    best = max(tqdm(rotations, desc="rotations", disable=None), key=search)
+    report("rotation", search, search.env.rules.pairs, best)
 
 
 def report(kind: str, search: Search, pairs: np.ndarray, cycle: Sequence[int]) -> None:

@@ -43,6 +43,8 @@ SHORT = {
     "RotatingTank2D": TANK,
     "StationaryTank2D": {"vessel": {"n_electrodes": 8}, "schedule": {"scored_steps": 5}},
     "PipeInjection": {"schedule": {"scored_steps": 4}},
+    "TankTracking": {"schedule": {"scored_steps": 4}},
+    "SearchAndTrack": {"schedule": {"scored_steps": 4}},
     "TankInjection": {"schedule": {"warm_up": 2, "scored_steps": 3}},
 }
 """Name of a world -> overrides for short episodes. Worlds of the track injection keep vessel and flow, for which the
@@ -53,7 +55,7 @@ def world(name: str) -> dict:
     """Return keyword arguments for short episodes of an id."""
     each = entry(name)
     kind = each.world.name
-    if each.track == "injection":
+    if each.track == "injection" and kind not in ("TankTracking", "SearchAndTrack"):
         kind = "TankInjection" if kind == "RotatingTank2D" else "PipeInjection"
     assert kind in SHORT, f"{name} has no short version yet: give {kind!r} one in tests/short.py"
     return {"world": SHORT[kind]}

@@ -35,6 +35,6 @@ class Policy:
             self.belief = BodyBelief(self.rules, observation)
         else:
             self.belief.update(observation)
-        next_state = self.core.t + 1
-        criterion = self.belief.criteria(self.path.centres[next_state])[0]
-        return self.rules.action(int(criterion.argmax()))
+        t = self.core.t + 1
+        centre = self.path.centres[t] if self.path.present[t] else None
+        return self.rules.action(int(self.belief.criteria(centre)[0].argmax()))

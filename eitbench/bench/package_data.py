@@ -11,6 +11,7 @@ from eitbench.bench.tracks import builtin_ids
 from eitbench.data.cache import Arrays, File, load_shipped, ship
 from eitbench.data.episode_cache import csr_of, prefix_file, region_file, scoring_constants_file
 from eitbench.estimation.onboard.models import build_packed_model, reduced_model_key, unpack_model
+from eitbench.worlds.bodies import WanderingBody
 from eitbench.worlds.registry import Entry, entries, entry
 
 ARRAY_TOLERANCE = 1e-5
@@ -32,7 +33,7 @@ def _files(registered: Entry) -> Iterator[File]:
                  if each.world.truth_config == world.truth_config)
     if needed <= world.warm_up:
         yield prefix_file(world, needed)
-    if registered.track == "injection":
+    if registered.track == "injection" and not isinstance(world.target, WanderingBody):
         yield File(reduced_model_key(world), lambda: build_packed_model(world.fault_free))
 
 

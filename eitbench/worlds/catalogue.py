@@ -7,7 +7,7 @@ from dataclasses import replace
 from functools import partial
 from typing import Any
 
-from eitbench.worlds.bodies import Cylinders, ResistiveDisc
+from eitbench.worlds.bodies import Cylinders, ResistiveDisc, WanderingBody
 from eitbench.worlds.flows import (
     FlowPastBulge,
     LaminarFlow,
@@ -396,3 +396,39 @@ pair, the clairvoyant policy improves ẽ_c by 8 % over random pairs, and no ada
 outperforms the best pair. The normalised adaptivity gap is 0.25, with a 95 % interval from 0.05 to
 0.40 over the 10 episodes of the leaderboard, a quotient of small numbers (`docs/injection.md`).
 """)
+
+# -- Tank with a body that moves by itself --
+
+TANK_TRACKING = World(
+    "TankTracking", RoundTank(), NoFlow(), WanderingBody(),
+    Instrument(noise_relative=3e-3, noise_relative_to_max=3e-4, readings="neighbours"),
+    Schedule(time_step=0.025, scored_steps=96, pattern=TankOppositeDiagonalPattern(), warm_up=16),
+    Prior(expected_concentration=30.0))
+"""The concentration of the liquid is known, as in difference imaging. All numbers [E]."""
+SEARCH_AND_TRACK = replace(TANK_TRACKING, name="SearchAndTrack",
+                           target=WanderingBody(visit_time=1.0))
+
+TRACKING_TEXT = """
+The liquid is at rest, and a plastic body with a radius of 14 to 18 mm moves by itself in the tank:
+it runs straight ahead at 0.1 to 0.3 m/s and turns at random times, 0.4 s apart in the mean. A
+serial instrument injects through one pair of electrodes every 25 ms and measures only the
+electrodes next to the driven ones, four at most. Its sensitivity is local, so that the current
+should enter near the body.
+
+The filter inside is a particle filter of position, velocity and size of the body, with another
+motion than the true one (an Ornstein–Uhlenbeck velocity). The estimate is the mean image of the
+particles, and the reward and ẽ_c are those of an image, as in the other environments. The
+concentration of the liquid is known. Voltages that are not measured are zero in the observation.
+"""
+
+register_injection(TANK_TRACKING, "eitbench/TankTracking-v0", test_seeds="test:0-49",
+                   is_starting_point=True, description=f"""
+Follow a body that moves by itself, with a few measurements of each injection. This environment is
+a competition: adaptive policies have a smaller error than the best cycle (`docs/injection.md`).
+{TRACKING_TEXT}""")
+register_injection(SEARCH_AND_TRACK, "eitbench/SearchAndTrack-v0", test_seeds="test:0-49",
+                   description=f"""
+Detect a body that comes and goes without notice, and follow it while it is there. It stays for 1 s
+and is absent for 0.5 s, both in the mean and exponentially distributed; it returns anywhere. A
+policy has to search while the tank seems empty, and to track the body afterwards.
+{TRACKING_TEXT}""")

@@ -40,8 +40,8 @@ class BodyBelief:
 
         They treat particles and voltages as jointly Gaussian: the decrease of the expected squared
         error of the image on the coarse grid, and half of the decrease of the log-determinant of
-        the voltages' covariance. For oracles, ``centre`` (2,) in m is the mean to which the
-        predicted particles are moved.
+        the voltages' covariance. For oracles, ``centre`` (2,) in m is the true position of a
+        present body, to which the mean of the predicted particles is moved.
         """
         model = self._filters.model
         weights = self._filters.weights[0]
@@ -49,7 +49,8 @@ class BodyBelief:
         particles = model.move(self._filters.particles, np.random.default_rng(1))
         if centre is not None:
             moved = particles.centres + centre - weights @ particles.centres[0]
-            particles = particles._replace(centres=reflect(moved, moved, model.limit)[0])
+            particles = particles._replace(centres=reflect(moved, moved, model.limit)[0],
+                                           present=np.ones_like(particles.present))
         index, share = (each[:, 0] for each in model.cells(particles))
         images = np.einsum("kp,kpm->pm", share, model.patches.T[index])
         P, n_pairs = len(weights), len(self.rules.pairs)
