@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import lru_cache
 from typing import TYPE_CHECKING
 
@@ -11,7 +11,7 @@ import numpy as np
 
 from eitbench import _check
 from eitbench.physics.flow import PlaneChannelFlow, RoundPipeFlow
-from eitbench.worlds.fields import check_positive
+from eitbench.worlds.fields import ADDED_LATER, check_positive
 
 if TYPE_CHECKING:
     from eitbench.numerics.mesh import Mesh
@@ -273,6 +273,8 @@ class RoundTank:
     """z in Ω·m²"""
     molar_conductivity: float = 0.01
     """Λ in S·m²/mol; σ = Λc"""
+    truth_refinement: int = field(default=1, metadata=ADDED_LATER)
+    """factor of the numbers of rings of the truth's meshes, for small bodies"""
 
     coarse_grid_shape = (6, 6)
     is_elongated = False
@@ -282,6 +284,7 @@ class RoundTank:
         check_positive(self, radius="m")
         _check_electrodes(self)
         _check.integer("n_electrodes", self.n_electrodes, low=4)
+        _check.integer("truth_refinement", self.truth_refinement, low=1)
 
     @property
     def electrode_spans(self) -> np.ndarray:
@@ -298,13 +301,14 @@ class RoundTank:
     def transport_mesh(self, fine: bool) -> tuple[Mesh, np.ndarray]:
         """Return a mesh of 4,921 nodes for the truth or 1,261 for the model, without an inlet."""
         from eitbench.numerics.round_meshes import uniform_disc
-        return uniform_disc(self.radius, 40 if fine else 20), np.empty(0, dtype=int)
+        rings = 40 * self.truth_refinement if fine else 20
+        return uniform_disc(self.radius, rings), np.empty(0, dtype=int)
 
     def electrode_model(self, fine: bool) -> CompleteElectrodeModel:
         """Return a model with about 9,300 unknowns for the truth, 3,100 for the model."""
         from eitbench.numerics.round_meshes import electrode_disc
         from eitbench.physics.cem import CompleteElectrodeModel
-        at_electrodes, rings = (8, 22) if fine else (4, 13)
+        at_electrodes, rings = (8, 22 * self.truth_refinement) if fine else (4, 13)
         mesh = electrode_disc(self.radius, self.electrode_spans, at_electrodes, rings)
         return CompleteElectrodeModel(mesh, self.electrodes(mesh), self.contact_impedance)
 

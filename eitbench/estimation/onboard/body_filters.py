@@ -12,7 +12,15 @@ import scipy.sparse as sp
 from eitbench.data.episode_cache import score_mass, step_error
 from eitbench.estimation.onboard.episode_filters import EpisodeFilters, Innovation
 from eitbench.estimation.onboard.linearisation import linearisation_table, std_from_variance
-from eitbench.worlds.bodies import TRANSITION_WIDTH, WanderingBody, disc_indicator, reflect
+from eitbench.numerics.fem import mass_matrix
+from eitbench.worlds.bodies import (
+    DISC_POINTS,
+    DISC_WEIGHTS,
+    TRANSITION_WIDTH,
+    WanderingBody,
+    disc_indicator,
+    reflect,
+)
 
 if TYPE_CHECKING:
     from eitbench.estimation.onboard.rules import Rules
@@ -66,12 +74,13 @@ class BodyModel:
         grid, _ = reflect(grid, grid, self.limit)
         discs = np.array([disc_indicator(points, centre, self.radius, TRANSITION_WIDTH)
                           for centre in grid])
+        # a coarse mesh distorts the area of a small disc
+        area = mass_matrix(self.table.task.mesh).sum(axis=0)
+        discs *= (math.pi * self.radius**2 / (discs @ area))[:, None]
         contrast = target.concentration / target.background - 1.0
         reference = self.table.linearisation(0)
         self.resistance = reference.resistance
-        L = len(self.resistance)
-        dipole = 2.0 * contrast / (2.0 + contrast)
-        self.signals = dipole * (reference.jacobian.reshape(L * L, -1) @ discs.T)
+        self.signals = 2.0 * contrast / (2.0 + contrast) * self._linearised(grid)
         """(L², G) change of 𝓡 by a disc at each grid point"""
         discs[discs < 1e-3] = 0.0
         self.images = sp.csr_array((contrast * target.background * discs).T)
@@ -86,6 +95,19 @@ class BodyModel:
                              / math.sqrt(3.0))
         self.leave, self.enter = (-math.expm1(-world.time_step / time)
                                   for time in (target.visit_time, target.absence_time))
+
+    def _linearised(self, grid: np.ndarray) -> np.ndarray:
+        """Return the derivatives (L², G) of 𝓡 by the logarithm of the conductivity in discs about
+        the grid points, from its density in space: a coarse mesh distorts a small disc."""
+        observation = self.table.task.observation
+        cem = observation.cem
+        conductivity = observation.conductivity(np.full(cem.mesh.n_nodes, self.target.background))
+        derivatives = cem.transfer_resistance_derivatives(conductivity)[1]
+        by_node = derivatives.reshape(len(conductivity), -1)
+        density = conductivity[0] * by_node / mass_matrix(cem.mesh).sum(axis=0)[:, None]
+        area = math.pi * self.radius**2
+        return area * sum(weight * (cem.mesh.interpolation_to(grid + self.radius * point) @ density)
+                          for weight, point in zip(DISC_WEIGHTS, DISC_POINTS, strict=True)).T
 
     def draw(self, random: np.random.Generator, count: int) -> tuple[np.ndarray, ...]:
         """Draw centres, velocities and areas of new particles, (count, …)."""
@@ -142,9 +164,9 @@ class BodyFilters(EpisodeFilters):
         self.model = body_model(self._rules.world.fault_free)
         self._random = np.random.default_rng(0)
         P = self.n_particles
-        new = self.model.draw(self._random, P)
-        self.particles = Particles(*(np.repeat(each[None], episodes, axis=0) for each in new),
-                                   np.ones((episodes, P), dtype=bool))
+        centres, velocities, areas = (np.repeat(each[None], episodes, axis=0)
+                                      for each in self.model.draw(self._random, P))
+        self.particles = Particles(centres, velocities, areas, np.ones((episodes, P), dtype=bool))
         self.weights = np.full((episodes, P), 1.0 / P)
         self._density: np.ndarray | None = None
 

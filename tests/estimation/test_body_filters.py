@@ -1,0 +1,131 @@
+"""The particle filter of a body: signals against the complete electrode model, weights against Bayes' formula, design
+criteria against a Gaussian of images and voltages."""
+
+from functools import lru_cache
+
+import numpy as np
+import pytest
+from eitbench.data.episodes import cached_truth_model
+from eitbench.envs.injection_core import InjectionCore
+from eitbench.estimation.onboard.body_belief import BodyBelief
+from eitbench.estimation.onboard.body_filters import MODEL_ERROR, BodyFilters, body_model
+from eitbench.estimation.onboard.rules import Rules
+from eitbench.worlds import entry
+from eitbench.worlds.bodies import TRANSITION_WIDTH, disc_indicator
+from eitbench.worlds.random_streams import episode_streams
+
+from short import world as short_world
+
+ID = "eitbench/TankTracking-v0"
+
+
+@lru_cache(maxsize=2)
+def rules_of(id=ID):
+    return Rules(entry(id).world.with_changes(short_world(id)["world"]))
+
+
+def believed(id=ID):
+    """Return a core after the first frame of an episode and the belief of its observation."""
+    core = InjectionCore(rules_of(id), "reduced")
+    core.reset([3])
+    return core, BodyBelief(core.rules, {name: array[0] for name, array in core.observe().items()})
+
+
+@pytest.mark.parametrize(("distance", "limit"), [(0.0, 0.05), (0.05, 0.05), (0.09, 0.06), (0.115, 0.12)])
+def test_signals_are_those_of_the_complete_electrode_model(distance, limit):
+    """On the finer mesh of the truth, for a body of the mean radius, also off the points of the grid."""
+    rules = rules_of()
+    model, truth = body_model(rules.world.fault_free), cached_truth_model(rules.world)
+    points, target = truth.transport.mesh.points, rules.world.target
+    centre = distance * np.array([np.cos(0.3), np.sin(0.3)])
+    liquid = np.full(len(points), target.background)
+    disc = disc_indicator(points, centre, model.radius, TRANSITION_WIDTH)
+    with_body = liquid + (target.concentration - target.background) * disc
+    expected = np.subtract(*(truth.observation.transfer_resistance(c) for c in (with_body, liquid)))
+    filters = BodyFilters(rules, np.zeros((1, 16, 16)))
+    filters.particles.centres[:] = centre
+    filters.particles.areas[:] = 1.0
+    index, weights = (each[:, 0, 0] for each in model.cells(filters.particles))
+    found = (model.signals[:, index] @ weights).reshape(16, 16)
+    scale = (found * expected).sum() / (found**2).sum()          # the effective area is estimated
+    assert np.linalg.norm(scale * found - expected) < limit * np.linalg.norm(expected)
+    assert scale == pytest.approx(1.0, abs=0.15)
+
+
+def test_weights_are_those_of_bayes_formula():
+    """One measurement from equal weights: the likelihood of each particle's voltages at the measured electrodes."""
+    core, _ = believed()
+    filters, rules = core._filters, core.rules
+    filters.weights[:] = 1.0 / filters.n_particles
+    pair = 57
+    (i, j), amplitude = rules.pairs[pair], rules.amplitude
+    resampled, filters._reweight = [], lambda log: resampled.append(log[0])
+    core.act(np.array([pair]))
+    model = filters.model
+    base = amplitude * (model.resistance[i] - model.resistance[j])
+    measured = [k for k in ((i - 1) % 16, (i + 1) % 16, (j - 1) % 16, (j + 1) % 16) if k not in (i, j)]
+    std = model.table.noise_std(base, 0.0)[measured]
+    expected = np.empty(filters.n_particles)
+    index, weights = (each[:, 0] for each in model.cells(filters.particles))
+    for p in range(filters.n_particles):
+        change = (model.signals[:, index[:, p]] @ weights[:, p]).reshape(16, 16)
+        signal = amplitude * (change[:, i] - change[:, j])[measured]
+        variance = std**2 + (MODEL_ERROR * signal)**2
+        residual = core._voltages[0, measured] - base[measured] - signal
+        expected[p] = -0.5 * (residual**2 / variance + np.log(variance)).sum()
+    np.testing.assert_allclose(resampled[0], expected, rtol=1e-9)
+    assert np.isnan(np.delete(core._voltages[0], measured)).all()
+
+
+def test_criteria_are_those_of_a_gaussian_of_images_and_voltages():
+    """A-criterion: the decrease of the image's variances by conditioning; D-criterion: half log det of S R⁻¹."""
+    _, belief = believed()
+    filters, rules = belief._filters, belief.rules
+    model = filters.model
+    gains, information = belief.criteria()
+    particles = model.move(filters.particles, np.random.default_rng(1))
+    index, share = (each[:, 0] for each in model.cells(particles))
+    w = filters.weights[0]
+    images = np.array([model.patches[:, index[:, p]] @ share[:, p] for p in range(len(w))])
+    changes = np.array([model.signals[:, index[:, p]] @ share[:, p] for p in range(len(w))]).reshape(-1, 16, 16)
+    for pair in (0, 7, 57, 119):
+        i, j = rules.pairs[pair]
+        current = np.zeros(16)
+        current[[i, j]] = rules.amplitude, -rules.amplitude
+        measured = rules.instrument.measured(current)
+        voltages = (changes @ current)[:, measured]
+        std = model.table.noise_std(model.resistance @ current, 0.0)[measured]
+        R = np.diag(std**2 + MODEL_ERROR**2 * (w @ voltages**2))
+        joint = np.cov(np.hstack([images, voltages]).T, aweights=w, bias=True)
+        m = images.shape[1]
+        S = joint[m:, m:] + R
+        assert gains[pair] == pytest.approx(np.trace(joint[:m, m:] @ np.linalg.solve(S, joint[m:, :m])), rel=1e-6)
+        assert information[pair] == pytest.approx(0.5 * np.linalg.slogdet(S @ np.linalg.inv(R))[1], rel=1e-6)
+
+
+@pytest.mark.parametrize("id", [ID, "eitbench/SearchAndTrack-v0"])
+def test_belief_is_the_filter_inside(id):
+    """A belief that a policy updates equals the environment's filter, to the bit."""
+    core, belief = believed(id)
+    for pair in (7, 100, 3):
+        core.act(np.array([pair]))
+        belief.update({name: array[0] for name, array in core.observe().items()})
+        for ours, inside in zip(belief._filters.particles, core._filters.particles, strict=True):
+            np.testing.assert_array_equal(ours, inside)
+        np.testing.assert_array_equal(belief._filters.weights, core._filters.weights)
+
+
+def test_estimate_finds_the_body():
+    """After an episode of one pair after another the mean image is darkest at the body."""
+    world = entry(ID).world
+    core = InjectionCore(Rules(world), "reduced")
+    seeds = [11, 12, 13, 14]
+    core.reset(seeds)
+    pairs = core.rules.pairs.tolist()
+    distances = []
+    for k in range(core.length):
+        core.act(np.full(4, pairs.index(sorted([5 * k % 16, (5 * k + 3) % 16]))))
+        darkest = core.task.mesh.points[core.estimate()[0].argmin(axis=1)]
+        true = [world.target.path(world, episode_streams(seed).flow).centres[core.t] for seed in seeds]
+        distances.append(np.linalg.norm(darkest - true, axis=1))
+    assert np.median(distances) < 0.01

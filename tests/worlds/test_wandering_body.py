@@ -1,0 +1,88 @@
+"""A body that moves by itself: its path, its visits, and an instrument that measures a few electrodes."""
+
+import numpy as np
+import pytest
+from eitbench.data.episodes import simulate
+from eitbench.worlds import entry
+from eitbench.worlds.bodies import WanderingBody, disc_indicator, reflect
+from eitbench.worlds.instrument import Instrument
+from eitbench.worlds.random_streams import episode_streams
+
+TRACKING, SEARCH = (entry(f"eitbench/{name}-v0").world for name in ("TankTracking", "SearchAndTrack"))
+
+
+def paths(world, count=60, n_steps=400):
+    long = world.with_changes({"schedule": {"scored_steps": n_steps}})
+    return [long.target.path(long, episode_streams(seed).flow) for seed in range(count)]
+
+
+def test_path_keeps_its_speed_between_turns_and_stays_inside():
+    """Speeds are in their range and turns are as frequent as the run time says; a present body stays."""
+    body, turns, speeds = TRACKING.target, [], []
+    for path in paths(TRACKING):
+        assert path.present.all() and body.radius_range[0] <= path.radius <= body.radius_range[1]
+        assert np.hypot(*path.centres.T).max() <= TRACKING.vessel.radius - path.radius + 1e-12
+        moved = np.diff(path.centres, axis=0) / TRACKING.time_step
+        inside = np.hypot(*path.centres.T) < 0.1
+        free = inside[:-1] & inside[1:]
+        speeds.append(np.hypot(*moved.T)[free])
+        same = np.linalg.norm(np.diff(moved, axis=0), axis=1) < 1e-9
+        turns.append(~same[free[1:] & free[:-1]])
+    speeds, turns = np.concatenate(speeds), np.concatenate(turns)
+    assert body.speed_range[0] - 1e-9 <= speeds.min() and speeds.max() <= body.speed_range[1] + 1e-9
+    expected = -np.expm1(-TRACKING.time_step / body.run_time)
+    assert turns.mean() == pytest.approx(expected, abs=4 * np.sqrt(expected / turns.size))
+
+
+def test_visits_last_as_long_as_they_should():
+    """The fraction of time with a body is visit / (visit + absence)."""
+    present = np.array([path.present[80:] for path in paths(SEARCH)])
+    body = SEARCH.target
+    expected = body.visit_time / (body.visit_time + body.absence_time)
+    assert present.mean() == pytest.approx(expected, abs=0.05)
+    ends = (present[:, :-1] & ~present[:, 1:]).sum() / present[:, :-1].sum()
+    assert ends == pytest.approx(-np.expm1(-SEARCH.time_step / body.visit_time), rel=0.1)
+
+
+def test_reflection_keeps_the_speed_and_ends_inside():
+    random = np.random.default_rng(0)
+    velocities = random.normal(size=(200, 2))
+    centres = random.uniform(-0.8, 0.8, (200, 2))
+    new, after = reflect(centres, velocities, 0.7)
+    assert np.hypot(*new.T).max() <= 0.7
+    np.testing.assert_allclose(np.hypot(*after.T), np.hypot(*velocities.T), rtol=1e-12)
+    crossed = np.hypot(*centres.T) > 0.7
+    np.testing.assert_array_equal(new[~crossed], centres[~crossed])
+    assert ((new * after).sum(axis=1)[crossed] <= 1e-12).all()
+
+
+def test_truth_is_the_body_on_its_path():
+    """Low concentration in the body, none of it when the body is absent; the cache has the same."""
+    short = SEARCH.with_changes({"schedule": {"scored_steps": 40, "warm_up": 0}})
+    seed = next(seed for seed in range(50) if not short.target.path(short, episode_streams(seed).flow).present.all())
+    path = short.target.path(short, episode_streams(seed).flow)
+    episode = simulate(short, seed, cache=False)
+    points = short.truth_model().transport.mesh.points
+    for t, concentration in enumerate(episode.concentration):
+        expected = 30.0 - 28.5 * path.present[t] * disc_indicator(points, path.centres[t], path.radius, 0.003)
+        np.testing.assert_allclose(concentration, expected, rtol=1e-6)
+
+
+def test_electrodes_next_to_the_driven_ones_are_measured():
+    few, every = Instrument(readings="neighbours"), Instrument()
+    currents = np.zeros((3, 16))
+    currents[0, [0, 8]], currents[1, [3, 4]] = (0.1, -0.1), (0.1, -0.1)
+    assert [np.flatnonzero(row).tolist() for row in few.measured(currents)] == [[1, 7, 9, 15], [2, 5], []]
+    assert every.measured(currents).all()
+    with pytest.raises(ValueError, match="readings must be one of all, neighbours"):
+        Instrument(readings="some")
+
+
+@pytest.mark.parametrize(("changes", "message"), [
+    ({"radius_range": (0.01, 0.2)}, "radius_range must end below half of the radius of a round tank"),
+    ({"speed_range": (0.3, 0.1)}, "speed_range must be a range"), ({"run_time": 0.0}, "run_time must be"),
+    ({"visit_time": -1.0}, "visit_time must be")])
+def test_an_invalid_body_is_refused(changes, message):
+    with pytest.raises(ValueError, match=message):
+        TRACKING.with_changes({"target": changes})
+    assert isinstance(TRACKING.target, WanderingBody)
