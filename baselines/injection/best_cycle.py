@@ -1,5 +1,8 @@
 """Best cycle: round-robin over up to four pairs, optimised on training episodes; a budget is used
-at equal intervals."""
+at equal intervals.
+
+For a body in a tank a pair that rotates around the tank is better.
+"""
 
 from itertools import cycle
 from typing import Any
@@ -8,17 +11,21 @@ import numpy as np
 
 from eitbench.estimation.onboard.rules import Rules
 
+ROTATION = [sorted((5 * k % 16, (5 * k + 3) % 16)) for k in range(16)]
+"""Three electrodes apart, and five further in each step."""
+
 
 class Policy:
     # Found by `python studies/search_injections.py`; electrodes by world.
     parameters: dict[str, Any] = {  # noqa: RUF012
         "cycle": {"Pipe2D": [[0, 8]], "Pipe2D with faults": [[8, 11], [0, 4], [2, 8], [0, 14]],
                   "Pipe2DIntermittent with a budget": [[0, 10]],
-                  "Pipe2DDriftingVelocity": [[7, 8], [1, 7]], "RotatingTank2D": [[9, 15]]},
+                  "Pipe2DDriftingVelocity": [[7, 8], [1, 7]], "RotatingTank2D": [[9, 15]],
+                  "TankTracking": ROTATION, "SearchAndTrack": ROTATION},
         "environment_steps": {
             "Pipe2D": 346_368, "Pipe2D with faults": 608_768,
             "Pipe2DIntermittent with a budget": 768_768, "Pipe2DDriftingVelocity": 217_792,
-            "RotatingTank2D": 333_696}}
+            "RotatingTank2D": 333_696, "TankTracking": 712_704, "SearchAndTrack": 746_496}}
 
     @classmethod
     def suits(cls, rules: Rules) -> bool:
