@@ -283,7 +283,8 @@ def _episode_numbers(world: World, name: str) -> dict[str, Any]:
         "resistance": entries["transfer_resistance"][steps][:, [0, 0, 1, L // 2],
                                                             [1, L // 2, L - 1, L // 2]],
         "noise": entries["noise"][steps][:, [0, L - 1]],
-        "voltages": voltages[steps][:, [0, L // 2, L - 1]],
+        # NaN where the instrument does not measure
+        "voltages": np.nan_to_num(voltages[steps][:, [0, L // 2, L - 1]]),
         "moment": np.array([_sample(moments[k]) for k in steps]), "deviation": deviations[steps],
         "mean_moment": _sample(moments.mean(axis=0, dtype=float)),
         "square": squares[steps], "homogeneous": homogeneous, "floor": float(np.mean(errors)),
