@@ -244,9 +244,16 @@ def _run_policy(env: InjectionEnv, policy: Method, seed: int) -> EpisodeRun:
         actions.append(action)
         if (error := env.error) is not None:
             means, stds = env.core.estimate()
-            scored.append((t, error, means[0], stds[0], env.core.innovations()[0]))
-    states, errors, mean, std, innovations = zip(*scored, strict=True)
+            scored.append((t, error, means[0], stds[0], env.core.innovations()[0],
+                           env.core.positions()))
+    states, errors, mean, std, innovations, positions = zip(*scored, strict=True)
     world = env.core.world
+    distances = None
+    if env.rules.tracks_body:
+        path = world.target.path(world, episode_streams(seed).flow)
+        present = path.present[list(states)]
+        off = np.concatenate(positions) - path.centres[list(states)]
+        distances = np.hypot(*off[present].T) if present.any() else None
     interpolation, mass = region_operators(world)
     used = [each for each in innovations if each is not None]       # None: all were rejected
     outcome = Outcome(
@@ -254,7 +261,7 @@ def _run_policy(env: InjectionEnv, policy: Method, seed: int) -> EpisodeRun:
         n_injections=sum(bool(each.any()) for each in currents),
         mean=(interpolation @ np.array(mean).T).T, std=(interpolation @ np.array(std).T).T,
         truth=simulate(world, seed, progress=False).concentration[list(states)].astype(float),
-        mass=mass, points=truth_mesh(world).points,
+        mass=mass, points=truth_mesh(world).points, distances=distances,
         innovations=([each.value for each in used],
                      [each.covariance for each in used]) if used else None)
     return EpisodeRun(outcome, np.array(currents), {}, actions, total)

@@ -22,6 +22,8 @@ SCORES_GROUP = "eitbench.scores"
 """Entry-point group of installed packages: each entry names a module that registers scores."""
 SCORE_DIRECTIONS = ("lower", "higher", "nominal", "none")
 """Direction in which a score improves; nominal: towards the value in its explanation."""
+LOST_DISTANCE = 0.04
+"""m, distance beyond which a body counts as lost: more than its diameter"""
 KINDS = (*TRACKS, "measured")
 """Tracks with simulated truth, and measurements of a real instrument."""
 
@@ -62,6 +64,8 @@ class Outcome:
     """(S, p) estimated and true m/s, and weights (p,), where the task includes the flow"""
     solute_flow: tuple[np.ndarray, np.ndarray] | None = None
     """(S,) estimated and true flow of solute through a pipe's outlet, mol/s (mol/(s·m) in 2D)"""
+    distances: np.ndarray | None = None
+    """m, between the estimated and the true position in each scored state with a body"""
     mean_nis: float | None = None
     """NIS/m of measurements"""
     ktc: float | None = None
@@ -243,6 +247,15 @@ for _score in (
     Score("solute_amount_error", "amount error",
           "relative error of the amount of solute that leaves the pipe during the scored states",
           _solute_amount_error, requires=("solute_flow",)),
+    Score("position_error", "position",
+          "median distance between the estimated and the true position of a body, mm",
+          lambda outcome: float(np.median(outcome.distances)), requires=("distances",),
+          tracks=("injection",), factor=1e3),
+    Score("lost_fraction", "lost",
+          f"fraction of the states with a body whose estimated position is off by more than "
+          f"{1e3 * LOST_DISTANCE:g} mm",
+          lambda outcome: float((outcome.distances > LOST_DISTANCE).mean()),
+          requires=("distances",), tracks=("injection",)),
     Score("coverage_50", "50 %", "fraction of the truth inside the reported 50 % interval",
           lambda outcome: scoring.coverage(*_uncertainty(outcome), 0.5),
           direction="nominal", requires=("std",), tracks=TRACKS),

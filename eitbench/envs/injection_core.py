@@ -11,6 +11,7 @@ from gymnasium import spaces
 from eitbench import _check
 from eitbench.data.episode_cache import instrument_faults, integrals, score_mass, scoring_constants
 from eitbench.envs.episodes import EpisodeCore, Observation
+from eitbench.estimation.onboard.body_filters import BodyFilters
 from eitbench.estimation.onboard.episode_filters import Innovation
 from eitbench.estimation.onboard.onboard_filter import OnboardFilter, filters_class
 from eitbench.estimation.onboard.rules import Rules
@@ -232,6 +233,11 @@ class InjectionCore(EpisodeCore):
         if not self._filters_type:
             return [None] * len(self.n_injections)
         return self._filters.innovations()
+
+    def positions(self) -> np.ndarray | None:
+        """Return the estimated positions (B, 2) of the bodies in m; None if the filter inside does
+        not track a body."""
+        return self._filters.positions() if isinstance(self._filters, BodyFilters) else None
 
     def action_masks(self) -> np.ndarray:
         """Return (B, actions) bool: actions that have an effect. When the budget is used up, only

@@ -268,6 +268,12 @@ class BodyFilters(EpisodeFilters):
     def stds(self) -> np.ndarray:
         return self._moments(self.model.images)[1]
 
+    def positions(self) -> np.ndarray:
+        """Return the mean positions (B, 2) in m of the particles that are present."""
+        weights = self.weights * self.particles.present
+        total = np.maximum(weights.sum(axis=1, keepdims=True), 1e-300)
+        return np.asarray(((weights / total)[..., None] * self.particles.centres).sum(axis=1))
+
     def velocity(self) -> None:
         return None
 
