@@ -1,9 +1,11 @@
-"""Normalised adaptivity gap of injection policies: largest benefit of using the measurements."""
+"""Value of adaptive injection: ratio of the errors of adaptive and open-loop policies, and the
+normalised adaptivity gap, the largest benefit of using the measurements."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
@@ -17,6 +19,8 @@ from eitbench.bench.statistics import MIN_EPISODES, stratified_bootstrap
 OPEN_LOOP = ("adjacent", "opposite", "transverse", "best_pair", "best_cycle", "best_currents",
              "schedule")
 """Built-in policies whose injections do not depend on the measurements."""
+NOT_ADAPTIVE = {*OPEN_LOOP, "random_pair", "clairvoyant", "true_position"}
+"""These, the naive baseline, and policies with access to the ground truth."""
 
 
 def policy_rows(jobs: Sequence[Job], results: Iterable[dict[str, Any]]) -> pd.DataFrame:
@@ -59,13 +63,42 @@ def adaptivity_gap(rows: pd.DataFrame, open_loop: Sequence[str] = OPEN_LOOP,
     return stratified_bootstrap({"episodes": np.arange(three.shape[1])}, gap)
 
 
+def adaptive_ratio(rows: pd.DataFrame) -> tuple[str, str, float, float, float]:
+    """Return the best adaptive and the best open-loop policy, and the ratio of their mean errors
+    with the ends of its 95 % bootstrap interval over the episodes.
+
+    ``ValueError`` unless policies of both kinds have run on all episodes.
+    """
+    errors = errors_by_policy(rows).dropna(axis=1)
+    adaptive = next((name for name in errors if name not in NOT_ADAPTIVE), None)
+    open_loop = next((name for name in errors if name in OPEN_LOOP), None)
+    if adaptive is None or open_loop is None:
+        raise ValueError("rows must hold an adaptive and an open-loop policy on the same episodes; "
+                         f"got {', '.join(map(str, errors))}")
+    two = errors[[adaptive, open_loop]].to_numpy().T
+
+    def ratio(episodes: np.ndarray) -> np.ndarray:
+        mean = two[:, episodes.astype(int)].mean(axis=-1)
+        return np.asarray(mean[0] / mean[1])
+
+    return adaptive, open_loop, *stratified_bootstrap(
+        {"episodes": np.arange(two.shape[1])}, ratio)
+
+
 def gap_text(rows: pd.DataFrame) -> str:
-    """Return the normalised adaptivity gap as text; empty if an episode lacks a policy for it."""
-    try:
-        gap, low, high = adaptivity_gap(rows)
-    except ValueError:
-        return ""
+    """Return ratio and normalised adaptivity gap as text, without the one for which an episode
+    lacks a policy."""
+    texts = []
+    with suppress(ValueError):
+        adaptive, open_loop, *ratio = adaptive_ratio(rows)
+        texts.append(f"error of {adaptive} / {open_loop}: {_with_interval(*ratio)}")
+    with suppress(ValueError):
+        texts.append(f"normalised adaptivity gap {_with_interval(*adaptivity_gap(rows))}")
+    episodes = f" over {rows['seed'].nunique()} episodes"
+    return "; ".join(texts) + episodes if texts else ""
+
+
+def _with_interval(value: float, low: float, high: float) -> str:
     interval = (f"95 % interval {low:.2f} to {high:.2f}" if math.isfinite(low)
                 else f"an interval takes {MIN_EPISODES} episodes")
-    episodes = f"{rows['seed'].nunique()} episodes"
-    return f"normalised adaptivity gap {gap:.2f} ({interval}) over {episodes}"
+    return f"{value:.2f} ({interval})"

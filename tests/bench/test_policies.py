@@ -14,7 +14,7 @@ from eitbench.data.seeds import parse_seeds
 from eitbench.envs.injection import InjectionEnv
 from eitbench.estimation.onboard.belief import Belief
 from eitbench.estimation.onboard.rules import Rules
-from eitbench.report.policies import adaptivity_gap, errors_by_policy, gap_text, policy_rows
+from eitbench.report.policies import adaptive_ratio, adaptivity_gap, errors_by_policy, gap_text, policy_rows
 from eitbench.worlds.catalogue import PIPE_2D
 from scipy.stats import t as student
 
@@ -229,8 +229,10 @@ def test_errors_of_policies_are_ordered_and_pool_trainings():
     found = errors_by_policy(rows)
     assert list(found) == ["clairvoyant", "ppo", "best_pair", "random_pair", "bold"]
     assert found["ppo"].tolist() == pytest.approx([2.0, 2.1, 2.2])
-    assert gap_text(rows) == "normalised adaptivity gap 0.49 (an interval takes 6 episodes) over 3 episodes"
-    assert gap_text(rows[rows["policy"] != "clairvoyant"]) == ""
+    ratio, few = "error of ppo / best_pair: 0.69", "(an interval takes 6 episodes)"
+    assert gap_text(rows) == f"{ratio} {few}; normalised adaptivity gap 0.49 {few} over 3 episodes"
+    assert gap_text(rows[rows["policy"] != "clairvoyant"]) == f"{ratio} {few} over 3 episodes"
+    assert gap_text(rows[rows["policy"] == "random_pair"]) == ""
 
 
 # -- errors -----------------------------------------------------------------------------------------------------------
@@ -278,6 +280,15 @@ def test_adaptivity_gap_is_the_formula():
     assert adaptivity_gap(table, ["a", "b"]) == (gap, low, high)
     same = hand_made(clairvoyant=[1.0] * 9, random_pair=[5.0] * 9, a=[2.0] * 9)
     assert adaptivity_gap(same, ["a"]) == (0.25, 0.25, 0.25)
+
+
+def test_adaptive_ratio_is_the_ratio_of_means():
+    """Of the best policy of each kind; policies with the ground truth and random ones do not count."""
+    table = hand_made(clairvoyant=[0.1] * 9, random_pair=[0.2] * 9, best_cycle=[2.0, 4.0] * 4 + [3.0],
+                      best_pair=[5.0] * 9, mine=[1.0, 2.0] * 4 + [1.5], other=[4.0] * 9)
+    assert adaptive_ratio(table) == ("mine", "best_cycle", *[pytest.approx(0.5)] * 3)
+    with pytest.raises(ValueError, match="rows must hold an adaptive and an open-loop policy"):
+        adaptive_ratio(hand_made(random_pair=[1.0], best_pair=[2.0]))
 
 
 def test_the_interval_of_the_adaptivity_gap_is_student_s():

@@ -58,6 +58,12 @@ def test_solute_flow():
     assert said["solute_amount_error"] == pytest.approx(2 / 7)
 
 
+def test_positions_of_a_body():
+    """Distances 1, 3 and 50 mm: the median is 3 mm, and a third of the states are lost."""
+    said = compute_scores("injection", outcome(distances=np.array([0.001, 0.05, 0.003])))
+    assert (said["position_error"], said["lost_fraction"]) == (pytest.approx(0.003), pytest.approx(1 / 3))
+
+
 def test_policies_have_theirs():
     """Policies have error, injections, time, and scores of the filter's uncertainty if it is available."""
     said = compute_scores("injection", Outcome(WORLD, 0.5, np.array([0.1, 0.3]), n_injections=7))
