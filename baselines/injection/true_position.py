@@ -1,8 +1,8 @@
 """True position: greedy, A-optimal, with the uncertainty of the filter about the true position of a
 body, an oracle.
 
-It shows what knowing where to look is worth: it knows the position, but the filter learns only from
-the injections that it makes.
+It measures the value of the position for the choice of the injections: the policy has access to
+it, the filter only to the voltages.
 """
 
 from typing import Any

@@ -418,7 +418,7 @@ should enter near the body.
 
 The filter inside is a particle filter of position, velocity and size of the body, with another
 motion than the true one (an Ornstein–Uhlenbeck velocity). The estimate is the mean image of the
-particles, and the reward and ẽ_c are those of an image, as in the other environments. The
+particles; reward and ẽ_c are computed from the image, as in the other environments. The
 concentration of the liquid is known. Voltages that are not measured are zero in the observation.
 """
 

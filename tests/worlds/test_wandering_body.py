@@ -17,7 +17,7 @@ def paths(world, count=60, n_steps=400):
 
 
 def test_path_keeps_its_speed_between_turns_and_stays_inside():
-    """Speeds are in their range and turns are as frequent as the run time says; a present body stays."""
+    """Speeds are in their range and turns have the frequency of the run time; a present body stays."""
     body, turns, speeds = TRACKING.target, [], []
     for path in paths(TRACKING):
         assert path.present.all() and body.radius_range[0] <= path.radius <= body.radius_range[1]

@@ -45,7 +45,7 @@ class BodyBelief:
         """
         model = self._filters.model
         weights = self._filters.weights[0]
-        # other random numbers than those of the filter's next step, which are not known
+        # the random numbers of the filter's next step are not known
         particles = model.move(self._filters.particles, np.random.default_rng(1))
         if centre is not None:
             moved = particles.centres + centre - weights @ particles.centres[0]

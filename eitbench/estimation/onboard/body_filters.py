@@ -291,7 +291,7 @@ def measured_first(measured: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 class FullBodyFilters(BodyFilters):
-    """The same with more particles, for scored runs."""
+    """Particle filters with more particles, for scored runs."""
 
     n_particles = FULL_PARTICLES
 
