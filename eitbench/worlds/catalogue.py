@@ -402,7 +402,7 @@ outperforms the best pair. The normalised adaptivity gap is 0.25, with a 95 % in
 TANK_TRACKING = World(
     "TankTracking", RoundTank(truth_refinement=2), NoFlow(), WanderingBody(),
     Instrument(noise_relative=3e-3, noise_relative_to_max=3e-4, readings="neighbours"),
-    Schedule(time_step=0.025, scored_steps=96, pattern=TankOppositeDiagonalPattern(), warm_up=16),
+    Schedule(time_step=0.025, scored_steps=92, pattern=TankOppositeDiagonalPattern(), warm_up=20),
     Prior(expected_concentration=30.0))
 """The concentration of the liquid is known, as in difference imaging. The error of the truth's
 voltages by its mesh is up to 0.4 standard deviations of the noise. All numbers [E]."""

@@ -183,10 +183,10 @@ def test_modules_of_entry_points_are_imported(monkeypatch, tmp_path):
 
 
 def test_groups_and_starting_points():
-    """Each built-in id is in a group; six are recommended to begin with."""
+    """Each built-in id is in a group; seven are recommended to begin with."""
     own = [each for id, each in entries().items() if id.startswith("eitbench/")]
     assert {each.group for each in own} == set(registry.GROUPS) - {"user-defined"}
-    assert sum(each.is_starting_point for each in own) == 6
+    assert sum(each.is_starting_point for each in own) == 7
     assert all((each.group == "robustness variants") == bool(each.nominal) for each in own)
     assert all((each.group == "injection") == (each.track == "injection") for each in own)
     register(QUIET, ID)
