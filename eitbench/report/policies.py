@@ -70,8 +70,8 @@ def adaptive_ratio(rows: pd.DataFrame) -> tuple[str, str, float, float, float]:
     ``ValueError`` unless policies of both kinds have run on all episodes.
     """
     errors = errors_by_policy(rows).dropna(axis=1)
-    adaptive = next((name for name in errors if name not in NOT_ADAPTIVE), None)
-    open_loop = next((name for name in errors if name in OPEN_LOOP), None)
+    adaptive = next((str(name) for name in errors if name not in NOT_ADAPTIVE), None)
+    open_loop = next((str(name) for name in errors if name in OPEN_LOOP), None)
     if adaptive is None or open_loop is None:
         raise ValueError("rows must hold an adaptive and an open-loop policy on the same episodes; "
                          f"got {', '.join(map(str, errors))}")
