@@ -397,27 +397,6 @@ def solve_lu(row_perm, column_perm, lower_pointer, lower_index, lower, upper_poi
 
 
 @njit(cache=True)
-def solve_lu_single(row_perm, column_perm, lower_pointer, lower_index, lower, upper_pointer,
-                    upper_index, upper, scale, right):
-    """Return the solution (n,) of A x = b for one right-hand side (n,), see `solve_lu`."""
-    n = len(scale)
-    work = np.empty(n)
-    for i in range(n):
-        work[row_perm[i]] = right[i]
-    for i in range(n):
-        total = work[i]
-        for e in range(lower_pointer[i], lower_pointer[i + 1]):
-            total -= lower[e] * work[lower_index[e]]
-        work[i] = total
-    for i in range(n - 1, -1, -1):
-        total = work[i]
-        for e in range(upper_pointer[i], upper_pointer[i + 1]):
-            total -= upper[e] * work[upper_index[e]]
-        work[i] = total * scale[i]
-    return work[column_perm]
-
-
-@njit(cache=True)
 def advance_wide(mass, explicit, implicit_inlet, lower, upper, scale, row_perm, unknown, inlet,
                  substeps, rate, state, before, slope, inflow, source, has_source, work):
     """Compute all sub-steps of `ConvectionDiffusion` for ``state`` (n, WIDE), in place.

@@ -74,13 +74,6 @@ class SparseLU:
             result[:, first:first + 8] = solution.reshape(n, 8)[:, :block.shape[1]]
         return result
 
-    def solve_single(self, right: np.ndarray) -> np.ndarray:
-        """Return A⁻¹ b for b (n,), faster than `solve`."""
-        rows, columns, lower, upper, scale = self.factors
-        solution: np.ndarray = compiled_kernels().solve_lu_single(rows, columns, *lower, *upper,
-                                                                  scale, right)
-        return solution
-
 
 def factorise_no_pivot(matrix: sp.csr_array | sp.csc_array, order: str) -> SuperLU:
     """Factorise without pivoting; ``order`` is SuperLU's name of the order of rows and columns."""

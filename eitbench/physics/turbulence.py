@@ -7,14 +7,11 @@ from dataclasses import dataclass
 
 import numpy as np
 import scipy.sparse as sp
-import skfem
-from skfem.helpers import dot, grad
 
 from eitbench.numerics.sparse_lu import SparseLU
 from eitbench.physics.transport import (
     MIN_WIDE_COLUMNS,
     ConvectionDiffusion,
-    VelocityField,
     supg_basis,
     upwinding,
     velocity_at,
@@ -118,15 +115,19 @@ class FluctuatingTransport(ConvectionDiffusion):
         self._eddies = eddies
         self._modes = eddies.modes(self.mesh.points)
         basis = supg_basis(self.mesh)
+        v = velocity_at(self.velocity, np.asarray(basis.global_coordinates()))
+        tau, _ = upwinding(basis, v, self.diffusivity)
         slopes = np.array([phi[0].grad[..., 0] for phi in basis.basis])           # (3, 2, cells)
+        loads = np.array([((phi[0] + tau * (v * phi[0].grad).sum(axis=0)) * basis.dx).sum(axis=1)
+                          for phi in basis.basis])            # of test functions, (3, cells)
         rows = np.arange(2 * basis.nelems).reshape(1, 2, -1)
-        nodes = basis.element_dofs[:, None]
-        self._gradient = sp.csr_matrix((slopes.ravel(), [
-            np.broadcast_to(each, slopes.shape).ravel() for each in (rows, nodes)]))
+        cells, nodes = (np.broadcast_to(each, slopes.shape).ravel()
+                        for each in (rows, basis.element_dofs[:, None]))
+        self._gradient = sp.csr_matrix((slopes.ravel(), (cells, nodes)))
+        tested = np.broadcast_to(loads[:, None], slopes.shape).ravel()
+        self._tested = sp.csr_matrix((tested, (nodes, cells)))[self._free]
         self._implicit = 2.0 * self.substeps / self.time_step * self._mass - self._explicit
         self._approximate = SparseLU(self._implicit[:, self._free], DROP)
-        tested = _cell_loads(basis, self.velocity, self.diffusivity)[self._free]
-        self._tested = sp.csr_matrix(sp.hstack([tested, tested]))
 
     def at(self, begin: float) -> FluctuatingTransport:
         """Return the transport of the step that begins at this time in s."""
@@ -166,12 +167,11 @@ class FluctuatingTransport(ConvectionDiffusion):
 
     def _iterate(self, right: np.ndarray, v: np.ndarray, new: np.ndarray, old: np.ndarray) -> None:
         """Solve A x + N(v) (x + ``old``)/2 = ``right`` for the free nodes of x = ``new``."""
-        factors = self._approximate
-        solve = factors.solve_single if new.ndim == 1 else factors.solve
         for _ in range(MAX_ITERATIONS):
             advected = self._tested @ (v * (self._gradient @ (new + old)).T).T
-            correction = solve(right - self._implicit @ new - 0.5 * advected)
-            new[self._free] += correction
+            residual = right - self._implicit @ new - 0.5 * advected
+            correction = self._approximate.solve(residual.reshape(len(residual), -1))
+            new[self._free] += correction.reshape(residual.shape)
             if np.abs(correction).max() <= RTOL * np.abs(new).max():
                 return
         raise ArithmeticError("fluctuations must be weaker or sub-steps shorter: the advection "
@@ -183,16 +183,3 @@ class FluctuatingTransport(ConvectionDiffusion):
         full = sp.csr_array(self._implicit + advection)
         load = right - advection @ old - full[:, self.inlet] @ new[self.inlet]
         new[self._free] = SparseLU(full[:, self._free]).solve(load)
-
-
-def _cell_loads(basis: skfem.CellBasis, velocity: VelocityField,
-                diffusivity: float) -> sp.csr_array:
-    """Return the integrals (n, cells) of the SUPG test functions over cells."""
-    v = velocity_at(velocity, np.asarray(basis.global_coordinates()))
-    tau, _ = upwinding(basis, v, diffusivity)
-
-    @skfem.BilinearForm
-    def tested(u, phi, w):
-        return u * (phi + w["tau"] * dot(w["v"], grad(phi)))
-
-    return tested.assemble(basis.with_element(skfem.ElementTriP0()), basis, v=v, tau=tau)
