@@ -33,6 +33,7 @@ SHORT = {
     "Pipe2DTimeVaryingVelocity": DRAWN,
     "Pipe2DSkewedVelocity": DRAWN,
     "Pipe2DObstacle": merged(FAST, {"flow": {"viscosity": 0.04}, "vessel": {"bulge": {"height": 0.01}}}),
+    "Pipe2DTurbulent": merged(FAST, {"flow": {"intensity": 0.02, "n_modes": 4}}),
     "Pipe2DShortSlugs": FAST,
     "Pipe2DStrongSlugs": FAST,
     "Pipe2DOtherVelocity": DRAWN,

@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import scipy.sparse as sp
-from scipy.sparse.linalg import SuperLU, splu
+from scipy.sparse.linalg import SuperLU, spilu, splu
 
 from eitbench.numerics.compiled import compiled_kernels, scratch
 
 CsrArrays = tuple[np.ndarray, np.ndarray, np.ndarray]
 """Pointers, indices and values of a sparse matrix, as in the kernels."""
+MAX_FILL = 5.0
+"""Entries of incomplete factors, relative to the matrix."""
+NO_PIVOT: dict[str, Any] = {"diag_pivot_thresh": 0.0, "options": {"SymmetricMode": True}}
+"""Arguments of SuperLU."""
 
 
 class LUFactors(NamedTuple):
@@ -39,14 +43,18 @@ class SparseLU:
     ----------
     matrix : (n, n) sparse
         With a symmetric pattern and a dominant diagonal: rows are not pivoted.
+    drop : float
+        Drop smaller entries of the factors, relative to their column, and keep the order of rows:
+        an approximation with fewer entries, for iterations.
 
     Attributes
     ----------
     factors : LUFactors
     """
 
-    def __init__(self, matrix: sp.csr_array) -> None:
-        factors = factorise_no_pivot(matrix, "MMD_AT_PLUS_A")
+    def __init__(self, matrix: sp.csr_array, drop: float = 0.0) -> None:
+        factors = (spilu(sp.csc_matrix(matrix), drop, MAX_FILL, permc_spec="NATURAL", **NO_PIVOT)
+                   if drop else factorise_no_pivot(matrix, "MMD_AT_PLUS_A"))
         L = sp.csr_array(sp.tril(factors.L, -1))
         U = sp.csr_array(sp.triu(factors.U, 1))
         self.factors = LUFactors(factors.perm_r.astype(np.int64), factors.perm_c.astype(np.int64),
@@ -69,5 +77,4 @@ class SparseLU:
 
 def factorise_no_pivot(matrix: sp.csr_array | sp.csc_array, order: str) -> SuperLU:
     """Factorise without pivoting; ``order`` is SuperLU's name of the order of rows and columns."""
-    return splu(sp.csc_matrix(matrix), permc_spec=order, diag_pivot_thresh=0.0,
-                options={"SymmetricMode": True})
+    return splu(sp.csc_matrix(matrix), permc_spec=order, **NO_PIVOT)

@@ -306,12 +306,12 @@ def inlet_nodes(mesh: Mesh, velocity: VelocityField) -> np.ndarray:
     """(n_inlet,) int, nodes of boundary facets where fluid enters: ∫ v·n < 0 by midpoint rule."""
     basis = skfem.FacetBasis(to_skfem(mesh), element(mesh.dim, 1), intorder=1)
     x = np.asarray(basis.global_coordinates())
-    speed = (_velocity_at(velocity, x) * np.asarray(basis.normals)).sum(axis=0).mean(axis=1)
+    speed = (velocity_at(velocity, x) * np.asarray(basis.normals)).sum(axis=0).mean(axis=1)
     facets = basis.find[speed < -1e-12 * max(1e-300, np.abs(speed).max())]
     return np.unique(basis.mesh.facets[:, facets])
 
 
-def _velocity_at(velocity: VelocityField, x: np.ndarray, name: str = "velocity") -> np.ndarray:
+def velocity_at(velocity: VelocityField, x: np.ndarray, name: str = "velocity") -> np.ndarray:
     """Return the field at quadrature points (d, cells, points), in the same shape."""
     points = x.reshape(len(x), -1).T
     value = _check.array(f"{name}(points)", velocity(points), points.shape, units="m/s")
@@ -322,16 +322,17 @@ def _velocity_at(velocity: VelocityField, x: np.ndarray, name: str = "velocity")
 
 
 @lru_cache(maxsize=8)
-def _supg_basis(mesh: Mesh) -> skfem.CellBasis:
+def supg_basis(mesh: Mesh) -> skfem.CellBasis:
+    """Return the basis of the transport's matrices."""
     return basis_on(mesh, 1, intorder=4)
 
 
 def _supg_matrices(mesh: Mesh, velocity: VelocityField,
                    diffusivity: float) -> tuple[sp.csr_array, sp.csr_array]:
     """Return the SUPG mass matrix and transport matrix (n, n): M ċ + K c = 0."""
-    basis = _supg_basis(mesh)
-    v = _velocity_at(velocity, np.asarray(basis.global_coordinates()))
-    tau, _ = _upwinding(basis, v, diffusivity)
+    basis = supg_basis(mesh)
+    v = velocity_at(velocity, np.asarray(basis.global_coordinates()))
+    tau, _ = upwinding(basis, v, diffusivity)
 
     @skfem.BilinearForm
     def mass(u, phi, w):
@@ -350,10 +351,10 @@ def _supg_derivatives(mesh: Mesh, velocity: VelocityField, diffusivity: float,
                       directions: Sequence[VelocityField],
                       ) -> list[tuple[sp.csr_array, sp.csr_array]]:
     """Return ∂M/∂θ_k and ∂K/∂θ_k, each (n, n), at θ = 0 for the velocity v + Σ θ_k v_k."""
-    basis = _supg_basis(mesh)
+    basis = supg_basis(mesh)
     x = np.asarray(basis.global_coordinates())
-    v = _velocity_at(velocity, x)
-    tau, by_velocity = _upwinding(basis, v, diffusivity)
+    v = velocity_at(velocity, x)
+    tau, by_velocity = upwinding(basis, v, diffusivity)
 
     @skfem.BilinearForm
     def mass(u, phi, w):
@@ -366,7 +367,7 @@ def _supg_derivatives(mesh: Mesh, velocity: VelocityField, diffusivity: float,
 
     derivatives = []
     for number, direction in enumerate(directions):
-        v_k = _velocity_at(direction, x, f"directions[{number}]")
+        v_k = velocity_at(direction, x, f"directions[{number}]")
         test = tau * v_k + (by_velocity * v_k).sum(axis=0) * v  # derivative of τ v
         along = sum(np.abs((v_k * phi[0].grad).sum(axis=0)) for phi in basis.basis)
         # In slow flow τ = |v|²/(3κ(Σᵢ|v·∇φᵢ|)²) depends on the direction only: at v = 0 the
@@ -379,7 +380,7 @@ def _supg_derivatives(mesh: Mesh, velocity: VelocityField, diffusivity: float,
     return derivatives
 
 
-def _upwinding(basis: skfem.Basis, v: np.ndarray,
+def upwinding(basis: skfem.Basis, v: np.ndarray,
                diffusivity: float) -> tuple[np.ndarray, np.ndarray]:
     """Return τ (cells, points) and its derivative by v (d, cells, points), zero where τ is zero.
 

@@ -15,6 +15,7 @@ from eitbench.worlds.flows import (
     RandomFlow,
     RandomWalkFlow,
     StirredFlow,
+    TurbulentFlow,
 )
 from eitbench.worlds.instrument import Instrument
 from eitbench.worlds.registry import register
@@ -139,6 +140,25 @@ and recirculates; it solves the steady Navier–Stokes equations. The task conta
 and a flow model that is a parabola between them at each x; `assume={"flow": "real"}` selects the
 true flow. The environment measures the loss by the simple model of the thesis and the benefit of a
 better one (Seppänen 2005, 5.1.1, names better fluid models as the next step).
+""")
+
+# -- 2D pipe with turbulent fluctuations of the velocity --
+
+PIPE_2D_TURBULENT = World("Pipe2DTurbulent", PlanePipe(), TurbulentFlow(), Slugs())
+"""Kinematic simulation with 40 random modes; all numbers of the fluctuations [E]."""
+
+register_extension(PIPE_2D_TURBULENT, "eitbench/Pipe2DTurbulent-v0", description="""
+The pipe of `eitbench/Pipe2D-v0` with turbulent fluctuations of the velocity, drawn for each
+episode. Eddies deform the slugs on their way through the pipe. The task specifies the mean flow
+only, a parabola, so that filters have an error of the flow that changes in space and time. The
+thesis assumes laminar flow and notes that this does not hold at its Reynolds number (Seppänen 2005,
+5.1). `true_model_smoother` receives the true flow.
+
+The rms of a component of the fluctuations is 10 % of the mean velocity. The fluctuations have no
+divergence, vanish at the walls, and have the integral scale R/2; the mean flow convects them, and
+each eddy decorrelates within its turnover time (`docs/turbulence.md`).
+`world={"flow": {"intensity": 0.05}}` changes the intensity, and
+`world={"flow": {"profile": "power-law"}}` the mean profile, also the profile in the task.
 """)
 
 # -- Robustness variants of the 2D pipe --

@@ -1,4 +1,4 @@
-"""Flow configurations: laminar, random, random walk, past a bulge, stirred, and none."""
+"""Flow configurations: laminar, random, random walk, turbulent, past a bulge, stirred, and none."""
 
 from __future__ import annotations
 
@@ -20,6 +20,7 @@ from eitbench.worlds.world import Discretisation, Flow, World, reject_unknown_as
 if TYPE_CHECKING:
     from eitbench.physics.navier_stokes import SteadyFlow
     from eitbench.physics.transport import Transport, VelocityField
+    from eitbench.physics.turbulence import RandomEddies
 
 PROFILES = ("parabolic", "plug", "power-law")
 """Velocity profiles that a model of a plane pipe may assume."""
@@ -182,6 +183,63 @@ class RandomWalkFlow(PipeFlow):
             return SkewedChannelFlow(mean, world.vessel.half_width)
 
         return flow
+
+
+@dataclass(frozen=True)
+class TurbulentFlow(PipeFlow):
+    """Mean flow through a plane pipe with random, divergence-free fluctuations in each episode.
+
+    The task specifies the mean flow only. All numbers [E].
+    """
+
+    intensity: float = 0.10
+    """rms of a velocity component's fluctuation, relative to ``mean_velocity``"""
+    integral_scale: float = 0.025
+    """m, longitudinal integral scale: half of R"""
+    n_modes: int = 40
+    """random modes of the stream function"""
+    profile: str = "parabolic"
+    """mean profile: parabolic, or power-law with the exponent 1/7"""
+
+    is_unsteady = True
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        _check.number("intensity", self.intensity, low=0.0, high=0.5)
+        check_positive(self, integral_scale="m")
+        _check.integer("n_modes", self.n_modes, low=1)
+        _check.choice("profile", self.profile, PROFILES[::2])
+
+    def check(self, world: World) -> None:
+        """Raise ``ValueError`` unless the vessel is a straight plane pipe."""
+        if not isinstance(world.vessel, PlanePipe) or world.vessel.bulge is not None:
+            raise ValueError(f"vessel must be a PlanePipe without a bulge, got {world.vessel!r}")
+
+    def nominal(self, world: World, fine: bool) -> VelocityField:
+        return self.assumed_velocity(world)
+
+    def assumed_velocity(self, world: World, **assumed: Any) -> VelocityField:
+        return super().assumed_velocity(world, **{"profile": self.profile} | assumed)
+
+    def draw(self, world: World, random: np.random.Generator) -> Callable[[int], Any]:
+        """Draw t -> the velocity at the end of the step to t."""
+        eddies = self._draw_eddies(world, random)
+        mean = self.nominal(world, fine=True)
+        return lambda t: lambda points: mean(points) + eddies.velocity(points, t * world.time_step)
+
+    def true_transport(self, world: World, model: Discretisation, random: np.random.Generator,
+                       ) -> Callable[[float], Transport]:
+        """See `World.true_transport`; t may be fractional if the model has shorter steps."""
+        from eitbench.physics.transport import ConvectionDiffusion
+        from eitbench.physics.turbulence import FluctuatingTransport
+        assert isinstance(model.transport, ConvectionDiffusion)
+        transport = FluctuatingTransport(model.transport, self._draw_eddies(world, random))
+        return lambda t: transport.at((t - 1.0) * world.time_step)
+
+    def _draw_eddies(self, world: World, random: np.random.Generator) -> RandomEddies:
+        from eitbench.physics.turbulence import RandomEddies
+        return RandomEddies.draw(random, world.vessel.half_width, self.mean_velocity,
+                                 self.intensity, self.integral_scale, self.n_modes)
 
 
 @dataclass(frozen=True)

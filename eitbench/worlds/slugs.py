@@ -120,10 +120,13 @@ class Slugs(Target):
 
     def evolve(self, world: World, episodes: Sequence[EpisodeStreams], truth: Discretisation,
                tick: Callable[[int], object], last: int) -> Iterator[TruthTrajectory]:
+        if getattr(world.flow, "is_unsteady", False):
+            yield from self._evolve_unsteady(world, episodes, truth, tick, last)
+            return
         flows = [world.flow.draw(world, episode.flow) for episode in episodes]
         inflows = [self.draw_inflow(world, episode.inflow) for episode in episodes]
         if flows[0] is None:  # all episodes have the same flow
-            for concentration in advect(world, lambda t: truth.transport, inflows, tick, last):
+            for concentration in advect(world, lambda t, k: truth.transport, inflows, tick, last):
                 yield TruthTrajectory(concentration, np.empty((last, 0)))
             return
 
@@ -135,31 +138,43 @@ class Slugs(Target):
         points = np.empty(0) if model is None else model.points
         for flow, inflow in zip(flows, inflows, strict=True):
             assert flow is not None
-            (concentration,) = advect(world, lambda t: transport(flow(t)),  # noqa: B023
+            (concentration,) = advect(world, lambda t, k: transport(flow(t)),  # noqa: B023
                                       [inflow], tick, last)
             velocity = np.array([flow(t).profile(points) for t in range(1, last + 1)])
             yield TruthTrajectory(concentration, velocity)
 
+    def _evolve_unsteady(self, world: World, episodes: Sequence[EpisodeStreams],
+                         truth: Discretisation, tick: Callable[[int], object],
+                         last: int) -> Iterator[TruthTrajectory]:
+        """Simulate episodes in flows that change within a time step."""
+        parts = world.vessel.n_truth_steps
+        for episode in episodes:
+            transport = world.flow.true_transport(world, truth, episode.flow)
+            inflow = self.draw_inflow(world, episode.inflow)
+            (concentration,) = advect(world, lambda t, k: transport(t + k / parts),  # noqa: B023
+                                      [inflow], tick, last)
+            yield TruthTrajectory(concentration, np.empty((last, 0)))
 
-def advect(world: World, transport_at: Callable[[int], Transport], inflows: Sequence[Inflow],
+
+def advect(world: World, transport_at: Callable[[int, int], Transport], inflows: Sequence[Inflow],
            tick: Callable[[int], object], last: int) -> np.ndarray:
     """Return concentrations (B, last + 1, n) in mol/m³ of B inflows in one flow, t = 0 … last.
 
-    ``transport_at(t)`` is the transport from t − 1 to t, in one or several steps; its mesh and
-    inlet do not change. The spin-up begins with the background concentration. ``tick``: see
-    `Target.evolve`.
+    ``transport_at(t, k)`` is the transport in part k = 0, 1, … of the step from t − 1 to t; its
+    mesh, inlet and time step do not change. The spin-up begins with the background concentration.
+    ``tick``: see `Target.evolve`.
     """
-    first = transport_at(1 - world.spin_up_steps)
+    first = transport_at(1 - world.spin_up_steps, 0)
+    dt = first.time_step
     inlet = first.mesh.points[first.inlet]
     states = np.empty((len(inflows), last + 1, first.mesh.n_nodes))
     c = np.full((first.mesh.n_nodes, len(inflows)), world.background)
     for t in range(-world.spin_up_steps + 1, last + 1):
-        transport = transport_at(t)
-        dt = transport.time_step
         for k in range(round(world.time_step / dt)):
             before = (t - 1) * world.time_step + k * dt
-            c = transport.step(c, *(np.stack([inflow(inlet, time) for inflow in inflows], axis=1)
-                                    for time in (before, before + dt)))
+            ends = (np.stack([inflow(inlet, time) for inflow in inflows], axis=1)
+                    for time in (before, before + dt))
+            c = transport_at(t, k).step(c, *ends)
         if t >= 0:
             states[:, t] = c.T
         tick(len(inflows))

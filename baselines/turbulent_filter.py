@@ -1,0 +1,81 @@
+"""Log-inflow filter with a dynamic flow error: the concentration error of the mean flow is part of
+the state, an autoregression in principal modes fitted to training episodes.
+
+Approximation errors that persist are estimated with the state (Huttunen & Kaipio, Inverse Problems
+and Imaging 1, 2007). `studies/turbulence.py` fits the modes.
+"""
+
+from pathlib import Path
+
+import numpy as np
+from scipy.linalg import block_diag
+
+from eitbench import Task
+from eitbench.estimation import (
+    DenseCovariance,
+    Filter,
+    FilterEstimator,
+    InflowWindow,
+    compatible_priors,
+    linearise_at_prediction,
+)
+
+BASELINE_DIR = Path(__file__).parent
+MODEL = BASELINE_DIR / "models" / "turbulent" / "pipe2dturbulent.npz"
+
+
+class FlowErrorWindow(InflowWindow):
+    """Inflow window x and errors z_t, z_t−1, …: c = c(x) + c_ref B z_t."""
+
+    def __init__(self, task: Task, prior, c_ref: float) -> None:
+        super().__init__(task, prior, c_ref)
+        with np.load(MODEL) as model:
+            self.modes, step, noise, start = (model[name].astype(float) for name in (
+                "modes", "transition", "noise", "initial"))
+        weights, variances = self.ar_model
+        self.n_inflow = weights.size
+        shift = np.eye(self.n_inflow, k=-weights.shape[1])
+        shift[:weights.shape[1]] = np.concatenate([np.diag(each) for each in weights], axis=1)
+        self.transition = block_diag(shift, step)
+        self.noise = np.zeros_like(self.transition)
+        self.noise[:len(variances), :len(variances)] = np.diag(variances)
+        self.noise[self.n_inflow:, self.n_inflow:] = noise
+        self.start = start
+
+    def initial(self):
+        covariance = block_diag(super().initial()[1].array, self.start)
+        return np.zeros(len(covariance)), DenseCovariance(covariance)
+
+    def propagate(self, mean, covariance, time: int):
+        P = self.transition @ covariance.array @ self.transition.T + self.noise
+        return self.transition @ mean, DenseCovariance(P)
+
+    def concentration(self, mean, lag: int = 0):
+        errors = mean[self.n_inflow:][:self.modes.shape[1]]
+        return super().concentration(mean[:self.n_inflow]) + self.c_ref * (self.modes @ errors)
+
+    def jacobian(self, mean, matrix, lag: int = 0):
+        by_inflow = super().jacobian(mean[:self.n_inflow], matrix)
+        return np.hstack([by_inflow, self.c_ref * (matrix @ self.modes)])
+
+    def variance(self, mean, covariance, lag: int = 0):
+        basis = self.response().basis
+        by_state = block_diag(super().jacobian(mean[:self.n_inflow], basis.T),
+                              self.c_ref * np.eye(self.modes.shape[1]))
+        both = np.hstack([basis, self.modes])
+        k = by_state.shape[1]
+        return (both @ (by_state @ covariance.array[:k, :k] @ by_state.T) * both).sum(axis=1)
+
+
+class Estimator(FilterEstimator):
+    subtracks = ("filter",)
+
+    def __init__(self, task: Task) -> None:
+        prior = compatible_priors(BASELINE_DIR / "priors", task, "logarithm")[0]
+        super().__init__(task, lambda c_ref: Filter(
+            FlowErrorWindow(task, prior, c_ref), linearise_at_prediction(task)))
+
+    @staticmethod
+    def suits(task: Task) -> bool:
+        """Return True in the world whose errors were fitted."""
+        return task.world == "Pipe2DTurbulent" and not task.lag
