@@ -30,20 +30,17 @@ class FlowErrorWindow(InflowWindow):
     def __init__(self, task: Task, prior, c_ref: float) -> None:
         super().__init__(task, prior, c_ref)
         with np.load(MODEL) as model:
-            self.modes, step, noise, start = (model[name].astype(float) for name in (
+            self.modes, step, noise, self.errors = (model[name].astype(float) for name in (
                 "modes", "transition", "noise", "initial"))
         weights, variances = self.ar_model
-        self.n_inflow = weights.size
-        shift = np.eye(self.n_inflow, k=-weights.shape[1])
-        shift[:weights.shape[1]] = np.concatenate([np.diag(each) for each in weights], axis=1)
+        self.n = weights.size
+        shift = np.eye(self.n, k=-weights.shape[1])
+        shift[:weights.shape[1]] = np.hstack([np.diag(each) for each in weights])
         self.transition = block_diag(shift, step)
-        self.noise = np.zeros_like(self.transition)
-        self.noise[:len(variances), :len(variances)] = np.diag(variances)
-        self.noise[self.n_inflow:, self.n_inflow:] = noise
-        self.start = start
+        self.noise = block_diag(np.diag(np.pad(variances, (0, self.n - len(variances)))), noise)
 
     def initial(self):
-        covariance = block_diag(super().initial()[1].array, self.start)
+        covariance = block_diag(super().initial()[1].array, self.errors)
         return np.zeros(len(covariance)), DenseCovariance(covariance)
 
     def propagate(self, mean, covariance, time: int):
@@ -51,20 +48,19 @@ class FlowErrorWindow(InflowWindow):
         return self.transition @ mean, DenseCovariance(P)
 
     def concentration(self, mean, lag: int = 0):
-        errors = mean[self.n_inflow:][:self.modes.shape[1]]
-        return super().concentration(mean[:self.n_inflow]) + self.c_ref * (self.modes @ errors)
+        z = mean[self.n:self.n + self.modes.shape[1]]
+        return super().concentration(mean[:self.n]) + self.c_ref * (self.modes @ z)
 
     def jacobian(self, mean, matrix, lag: int = 0):
-        by_inflow = super().jacobian(mean[:self.n_inflow], matrix)
-        return np.hstack([by_inflow, self.c_ref * (matrix @ self.modes)])
+        return np.hstack([super().jacobian(mean[:self.n], matrix),
+                          self.c_ref * (matrix @ self.modes)])
 
     def variance(self, mean, covariance, lag: int = 0):
-        basis = self.response().basis
-        by_state = block_diag(super().jacobian(mean[:self.n_inflow], basis.T),
-                              self.c_ref * np.eye(self.modes.shape[1]))
-        both = np.hstack([basis, self.modes])
-        k = by_state.shape[1]
-        return (both @ (by_state @ covariance.array[:k, :k] @ by_state.T) * both).sum(axis=1)
+        basis = self.response().basis                                       # orthonormal
+        slope = block_diag(super().jacobian(mean[:self.n], basis.T),
+                           self.c_ref * np.eye(self.modes.shape[1]))
+        both, k = np.hstack([basis, self.modes]), slope.shape[1]
+        return (both @ (slope @ covariance.array[:k, :k] @ slope.T) * both).sum(axis=1)
 
 
 class Estimator(FilterEstimator):

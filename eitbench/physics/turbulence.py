@@ -53,8 +53,8 @@ class RandomEddies:
         """Draw modes with random directions, phases and frequencies and E(k) ∝ k^(−5/3).
 
         The rms of a velocity component over the channel is ``intensity`` times ``mean_velocity`` in
-        m/s, averaged over phases; the longitudinal integral scale in m is that of isotropic modes
-        without the wall factor, Σ E_n 2/k_n / Σ E_n. ω_n is Gaussian, its standard deviation the
+        m/s, averaged over phases. The longitudinal integral scale in m of isotropic modes, without
+        the wall factor, is Σ E_n 2/k_n / Σ E_n. ω_n is Gaussian, its standard deviation the
         rate of the eddies' turnover, u' k_1^(1/3) k_n^(2/3).
         """
         k = np.geomspace(1.0, WAVE_NUMBER_RATIO, n_modes)
@@ -99,7 +99,7 @@ class FluctuatingTransport(ConvectionDiffusion):
     Each sub-step of `ConvectionDiffusion` has the velocity at its middle. Its equations are solved
     by iteration with incomplete factors of the mean flow's operator. The stream function ψ is
     linear in each cell: the discrete fluctuation has no divergence, does not cross walls, where
-    ψ = 0, and conserves solute. SUPG test functions are those of the mean flow.
+    ψ = 0, and conserves solute. Test functions have the mean flow's upwinding.
 
     Parameters
     ----------
