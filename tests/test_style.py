@@ -9,24 +9,14 @@ import pytest
 
 ROOT = Path(__file__).parent.parent
 PACKAGE = ROOT / "eitbench"
-<<<<<<< HEAD
-BUDGETS = {"numerics": 1605, "scoring": 110, "physics": 1460, "worlds": 2921, "data": 1620, "estimation": 6174,
-           "measured": 1918, "envs": 1750, "bench": 5088, "report": 3143, "rl": 837, "cli": 1025}
-=======
-BUDGETS = {"numerics": 1612, "scoring": 110, "physics": 1646, "worlds": 2849, "data": 1620, "estimation": 5790,
-           "measured": 1918, "envs": 1750, "bench": 5065, "report": 3110, "rl": 835, "cli": 1025}
->>>>>>> turb
+BUDGETS = {"numerics": 1604, "scoring": 110, "physics": 1642, "worlds": 3014, "data": 1618, "estimation": 6182,
+           "measured": 1917, "envs": 1743, "bench": 5088, "report": 3143, "rl": 837, "cli": 1022}
 """Package (or module) -> lines of Python allowed, blank lines and docstrings included. Each imports only from those
 before it."""
 TOP = 443
 """Lines allowed in the other modules at the top: public names, argument checks, files, messages."""
-<<<<<<< HEAD
-BASELINES = 2055
-TESTS = 20_395
-=======
-BASELINES = 2077
-TESTS = 20_323
->>>>>>> turb
+BASELINES = 2128
+TESTS = 20_554
 MODULES = {".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__"): path
            for path in PACKAGE.rglob("*.py")}
 
