@@ -205,7 +205,7 @@ class TurbulentFlow(PipeFlow):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        _check.number("intensity", self.intensity, low=0.0, high=0.5)
+        _check.number("intensity", self.intensity, low=0.0, high=0.3)
         check_positive(self, integral_scale="m")
         _check.integer("n_modes", self.n_modes, low=1)
         _check.choice("profile", self.profile, PROFILES[::2])
