@@ -9,7 +9,7 @@ import pytest
 
 ROOT = Path(__file__).parent.parent
 PACKAGE = ROOT / "eitbench"
-BUDGETS = {"numerics": 1604, "scoring": 110, "physics": 1642, "worlds": 3014, "data": 1618, "estimation": 6182,
+BUDGETS = {"numerics": 1604, "scoring": 110, "physics": 1642, "worlds": 3018, "data": 1618, "estimation": 6182,
            "measured": 1917, "envs": 1743, "bench": 5088, "report": 3143, "rl": 837, "cli": 1022}
 """Package (or module) -> lines of Python allowed, blank lines and docstrings included. Each imports only from those
 before it."""
