@@ -23,7 +23,7 @@ RTOL = 3e-4
 """Largest change in the last iteration of a sub-step, relative to the largest concentration."""
 DROP = 1e-3
 """Relative size of entries dropped from the factors of the mean flow's operator."""
-MAX_ITERATIONS = 30
+MAX_SOLVES = 30
 """Maximum number of iterations of a sub-step."""
 
 
@@ -167,7 +167,7 @@ class FluctuatingTransport(ConvectionDiffusion):
 
     def _iterate(self, right: np.ndarray, v: np.ndarray, new: np.ndarray, old: np.ndarray) -> None:
         """Solve A x + N(v) (x + ``old``)/2 = ``right`` for the free nodes of x = ``new``."""
-        for _ in range(MAX_ITERATIONS):
+        for _ in range(MAX_SOLVES):
             advected = self._tested @ (v * (self._gradient @ (new + old)).T).T
             residual = right - self._implicit @ new - 0.5 * advected
             correction = self._approximate.solve(residual.reshape(len(residual), -1))
@@ -175,7 +175,7 @@ class FluctuatingTransport(ConvectionDiffusion):
             if np.abs(correction).max() <= RTOL * np.abs(new).max():
                 return
         raise ArithmeticError("fluctuations must be weaker or sub-steps shorter: the advection "
-                              f"does not converge in {MAX_ITERATIONS} iterations")
+                              f"does not converge in {MAX_SOLVES} iterations")
 
     def _factor(self, right: np.ndarray, v: np.ndarray, new: np.ndarray, old: np.ndarray) -> None:
         """Solve the same by a factorisation, which is faster for many columns."""

@@ -283,7 +283,7 @@ def test_adaptivity_gap_is_the_formula():
 
 
 def test_adaptive_ratio_is_the_ratio_of_means():
-    """Of the best policy of each kind; policies with the ground truth and random ones do not count."""
+    """The best policy of each kind counts, without oracles and random pairs."""
     table = hand_made(clairvoyant=[0.1] * 9, random_pair=[0.2] * 9, best_cycle=[2.0, 4.0] * 4 + [3.0],
                       best_pair=[5.0] * 9, mine=[1.0, 2.0] * 4 + [1.5], other=[4.0] * 9)
     assert adaptive_ratio(table) == ("mine", "best_cycle", *[pytest.approx(0.5)] * 3)

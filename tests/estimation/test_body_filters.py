@@ -8,7 +8,7 @@ import pytest
 from eitbench.data.episodes import cached_truth_model
 from eitbench.envs.injection_core import InjectionCore
 from eitbench.estimation.onboard.body_belief import BodyBelief
-from eitbench.estimation.onboard.body_filters import MODEL_ERROR, BodyFilters, body_model
+from eitbench.estimation.onboard.body_filters import SIGNAL_ERROR, BodyFilters, body_model
 from eitbench.estimation.onboard.rules import Rules
 from eitbench.worlds import entry
 from eitbench.worlds.bodies import TRANSITION_WIDTH, disc_indicator
@@ -70,7 +70,7 @@ def test_weights_are_those_of_bayes_formula():
     for p in range(filters.n_particles):
         change = (model.signals[:, index[:, p]] @ weights[:, p]).reshape(16, 16)
         signal = amplitude * (change[:, i] - change[:, j])[measured]
-        variance = std**2 + (MODEL_ERROR * signal)**2
+        variance = std**2 + (SIGNAL_ERROR * signal)**2
         residual = core._voltages[0, measured] - base[measured] - signal
         expected[p] = -0.5 * (residual**2 / variance + np.log(variance)).sum()
     np.testing.assert_allclose(resampled[0], expected, rtol=1e-9)
@@ -92,10 +92,10 @@ def test_criteria_are_those_of_a_gaussian_of_images_and_voltages():
         i, j = rules.pairs[pair]
         current = np.zeros(16)
         current[[i, j]] = rules.amplitude, -rules.amplitude
-        measured = rules.instrument.measured(current)
+        measured = rules.instrument.measurement_mask(current)
         voltages = (changes @ current)[:, measured]
         std = model.table.noise_std(model.resistance @ current, 0.0)[measured]
-        R = np.diag(std**2 + MODEL_ERROR**2 * (w @ voltages**2))
+        R = np.diag(std**2 + SIGNAL_ERROR**2 * (w @ voltages**2))
         joint = np.cov(np.hstack([images, voltages]).T, aweights=w, bias=True)
         m = images.shape[1]
         S = joint[m:, m:] + R

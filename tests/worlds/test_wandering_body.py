@@ -72,8 +72,8 @@ def test_electrodes_next_to_the_driven_ones_are_measured():
     few, every = Instrument(readings="neighbours"), Instrument()
     currents = np.zeros((3, 16))
     currents[0, [0, 8]], currents[1, [3, 4]] = (0.1, -0.1), (0.1, -0.1)
-    assert [np.flatnonzero(row).tolist() for row in few.measured(currents)] == [[1, 7, 9, 15], [2, 5], []]
-    assert every.measured(currents).all()
+    assert [np.flatnonzero(row).tolist() for row in few.measurement_mask(currents)] == [[1, 7, 9, 15], [2, 5], []]
+    assert every.measurement_mask(currents).all()
     with pytest.raises(ValueError, match="readings must be one of all, neighbours"):
         Instrument(readings="some")
 

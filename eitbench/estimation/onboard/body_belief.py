@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from eitbench.estimation.onboard.body_filters import MODEL_ERROR, BodyFilters, measured_first
+from eitbench.estimation.onboard.body_filters import SIGNAL_ERROR, BodyFilters, measured_first
 from eitbench.worlds.bodies import reflect
 
 if TYPE_CHECKING:
@@ -24,8 +24,10 @@ class BodyBelief:
         self._filters = BodyFilters(rules, observation["frame"][None])
         model = self._filters.model
         L = len(model.resistance)
+        self._images = model.patches.toarray().T
         pair_currents = rules.action_currents[:len(rules.pairs)]
-        electrodes, self._measured = measured_first(rules.instrument.measured(pair_currents))
+        mask = rules.instrument.measurement_mask(pair_currents)
+        electrodes, self._measured = measured_first(mask)
         std = model.table.noise_std(pair_currents @ model.resistance, rules.instrument.noise_floor)
         self._variance = np.take_along_axis(std**2, electrodes, axis=1)
         source, sink = rules.pairs.T[:, :, None]
@@ -52,12 +54,12 @@ class BodyBelief:
             particles = particles._replace(centres=reflect(moved, moved, model.limit)[0],
                                            present=np.ones_like(particles.present))
         index, share = (each[:, 0] for each in model.cells(particles))
-        images = np.einsum("kp,kpm->pm", share, model.patches.T[index])
+        images = np.einsum("kp,kpm->pm", share, self._images[index])
         P, n_pairs = len(weights), len(self.rules.pairs)
         signals = np.einsum("kp,ekp->pe", self.rules.amplitude * share, model.signals[:, index])
         predicted = np.moveaxis(signals[:, self._from] - signals[:, self._to], 0, 1)
         mean = weights @ predicted
-        root = self._measured / np.sqrt(self._variance + MODEL_ERROR**2 * (weights @ predicted**2))
+        root = self._measured / np.sqrt(self._variance + SIGNAL_ERROR**2 * (weights @ predicted**2))
         scaled = (predicted - mean[:, None]) * root[:, None]
         weighted = np.swapaxes(weights[:, None] * scaled, 1, 2)
         S = weighted @ scaled + np.eye(scaled.shape[2])

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 SPACING = 5e-3
 """m, spacing of the grid on which signals and images of a body are tabulated."""
-MODEL_ERROR = 0.05
+SIGNAL_ERROR = 0.05
 """Standard deviation of the error of a body's signal, relative to the signal."""
 POSITION_JITTER = 1e-3
 """m, standard deviation of the movement of a resampled particle."""
@@ -86,7 +86,8 @@ class BodyModel:
         discs[discs < 1e-3] = 0.0
         self.images = sp.csr_array((contrast * target.background * discs).T)
         """(n, G) change of the concentration by a disc at each grid point in mol/m³"""
-        self.patches = (self.table.grid_averages @ self.images)
+        # sparse, since the bits of a dense product depend on the number of episodes
+        self.patches = sp.csr_array(self.table.grid_averages @ self.images)
         """(patches, G) the same on the coarse grid"""
         low, high = target.speed_range
         self.speed = math.sqrt((low**2 + low * high + high**2) / 6.0)
@@ -183,14 +184,14 @@ class BodyFilters(EpisodeFilters):
         model = self.model
         self.particles = model.move(self.particles, self._random)
         self._cells = model.cells(self.particles)
-        measured = self._rules.instrument.measured(currents) & currents.any(axis=1, keepdims=True)
-        electrodes, used = measured_first(measured)
-        base = currents @ model.resistance
+        mask = self._rules.instrument.measurement_mask(currents)
+        electrodes, used = measured_first(mask & currents.any(axis=1, keepdims=True))
+        base = (currents[:, None] @ model.resistance)[:, 0]     # one product per episode
         std = self.table.noise_std(base, self._rules.instrument.noise_floor)
         std, residual = (np.take_along_axis(each, electrodes, axis=1)[:, None]
                          for each in (std, voltages - base))
         signal = self._signals(currents, electrodes)                            # (B, P, m)
-        variance = std**2 + (MODEL_ERROR * signal)**2
+        variance = std**2 + (SIGNAL_ERROR * signal)**2
         residual = np.where(used[:, None], residual - signal, 0.0)
         variance = np.where(used[:, None], variance, 1.0)
         self._last = *self._innovation(residual, variance), used
@@ -199,7 +200,7 @@ class BodyFilters(EpisodeFilters):
         scaled = np.zeros(voltages.shape)
         np.put_along_axis(scaled, electrodes, innovation / np.sqrt(
             S.diagonal(axis1=1, axis2=2)), axis=1)
-        return scaled, np.ones(measured.shape, dtype=bool)
+        return scaled, np.ones(mask.shape, dtype=bool)
 
     def _signals(self, currents: np.ndarray, electrodes: np.ndarray) -> np.ndarray:
         """Return the signals (B, P, m) in V of the particles at electrodes (B, m) for currents
@@ -257,7 +258,7 @@ class BodyFilters(EpisodeFilters):
         if self._density is None:
             self._density = self._densities()
         first, second = self._density
-        mean = (images @ first.T).T
+        mean = np.ascontiguousarray((images @ first.T).T)   # bits of later sums depend on it
         return mean, std_from_variance((images**2 @ second.T).T - mean**2)
 
     def coarse_grid(self) -> tuple[np.ndarray, np.ndarray]:
