@@ -11,11 +11,7 @@ import numpy as np
 from scipy.linalg import cho_factor, cho_solve, solve_triangular
 
 from eitbench import Estimate, Task
-from eitbench.estimation import (
-    FilterEstimator,
-    LinearisedForwardModel,
-    smoothness_covariance,
-)
+from eitbench.estimation import FilterEstimator, LinearisedForwardModel, smoothness_covariance
 
 GAMMA = 0.8
 STD = 0.1

@@ -36,9 +36,7 @@ class Policy:
                    [[8, 14]], [[0, 7]], [[7, 8], [1, 7]], [[7, 8], [8, 15]],
                    [[7, 8], [1, 7], [9, 15], [0, 7]]]}
 
-    @classmethod
-    def suits(cls, rules: Rules) -> bool:
-        return not rules.tracks_body
+    suits = staticmethod(Belief.suits)
 
     def __init__(self, rules: Rules, random: np.random.Generator, core: InjectionCore) -> None:
         self.rules = rules

@@ -19,9 +19,7 @@ class Policy:
     # The best of a few values on the episodes train:0-11 of Pipe2DInjectionFlow.
     parameters: dict[str, Any] = {"steps": 4, "rest": 20}  # noqa: RUF012
 
-    @classmethod
-    def suits(cls, rules: Rules) -> bool:
-        return not rules.tracks_body
+    suits = staticmethod(Belief.suits)
 
     def __init__(self, rules: Rules, random: np.random.Generator) -> None:
         self.rules = rules

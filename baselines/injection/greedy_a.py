@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from eitbench.estimation.onboard.belief import Belief, BodyBelief, create_or_update
+from eitbench.estimation.onboard.belief import Belief, BodyBelief, belief_class
 from eitbench.estimation.onboard.rules import Rules
 
 
@@ -15,7 +15,8 @@ class Policy:
         self.belief: Belief | BodyBelief | None = None
 
     def act(self, observation: dict[str, np.ndarray]) -> Any:
-        self.belief = create_or_update(self.belief, self.rules, observation)
+        self.belief = belief = belief_class(self.rules).create_or_update(
+            self.belief, self.rules, observation)
         if not self.rules.is_injection_step(observation["left"]):
             return self.rules.action(None)
-        return self.rules.action(int(self.belief.criteria()[0].argmax()))
+        return self.rules.action(int(belief.criteria()[0].argmax()))

@@ -12,9 +12,7 @@ from eitbench.estimation.onboard.rules import Rules
 class Policy:
     parameters: dict[str, Any] = {"depth": 3, "width": 4}  # noqa: RUF012
 
-    @classmethod
-    def suits(cls, rules: Rules) -> bool:
-        return not rules.tracks_body
+    suits = staticmethod(Belief.suits)
 
     def __init__(self, rules: Rules, random: np.random.Generator) -> None:
         self.rules = rules

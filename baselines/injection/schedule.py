@@ -27,8 +27,8 @@ class Policy:
 
     @classmethod
     def suits(cls, rules: Rules) -> bool:
-        return (rules.world.velocity_model is None and rules.inflow == "white"
-                and not rules.tracks_body)
+        return (Belief.suits(rules) and rules.world.velocity_model is None
+                and rules.inflow == "white")
 
     def __init__(self, rules: Rules, random: np.random.Generator) -> None:
         self.rules = rules

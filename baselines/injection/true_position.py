@@ -31,10 +31,7 @@ class Policy:
         self.path = rules.world.target.path(rules.world, streams.flow)
 
     def act(self, observation: dict[str, np.ndarray]) -> Any:
-        if self.belief is None:
-            self.belief = BodyBelief(self.rules, observation)
-        else:
-            self.belief.update(observation)
+        self.belief = belief = BodyBelief.create_or_update(self.belief, self.rules, observation)
         t = self.core.t + 1
         centre = self.path.centres[t] if self.path.present[t] else None
-        return self.rules.action(int(self.belief.criteria(centre)[0].argmax()))
+        return self.rules.action(int(belief.criteria(centre)[0].argmax()))

@@ -11,7 +11,6 @@ from gymnasium import spaces
 from eitbench import _check
 from eitbench.data.episode_cache import instrument_faults, integrals, score_mass, scoring_constants
 from eitbench.envs.episodes import EpisodeCore, Observation
-from eitbench.estimation.onboard.body_filters import BodyFilters
 from eitbench.estimation.onboard.episode_filters import Innovation
 from eitbench.estimation.onboard.onboard_filter import OnboardFilter, filters_class
 from eitbench.estimation.onboard.rules import Rules
@@ -235,9 +234,8 @@ class InjectionCore(EpisodeCore):
         return self._filters.innovations()
 
     def positions(self) -> np.ndarray | None:
-        """Return the estimated positions (B, 2) of the bodies in m; None if the filter inside does
-        not track a body."""
-        return self._filters.positions() if isinstance(self._filters, BodyFilters) else None
+        """Return the estimated positions (B, 2) of the bodies in m; None without a body."""
+        return self._filters.positions()
 
     def action_masks(self) -> np.ndarray:
         """Return (B, actions) bool: actions that have an effect. When the budget is used up, only

@@ -4,7 +4,7 @@ normalised adaptivity gap, the largest benefit of using the measurements."""
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from typing import Any
 
@@ -54,13 +54,8 @@ def adaptivity_gap(rows: pd.DataFrame, open_loop: Sequence[str] = OPEN_LOOP,
         raise ValueError("rows must hold clairvoyant, random_pair and some open-loop policies on "
                          f"the same episodes; got {', '.join(map(str, errors))}")
     best = errors[blind].mean().idxmin()
-    three = errors[[best, "random_pair", "clairvoyant"]].to_numpy().T
-
-    def gap(episodes: np.ndarray) -> np.ndarray:
-        open_, random, clairvoyant = three[:, episodes.astype(int)].mean(axis=-1)
-        return np.asarray((open_ - clairvoyant) / (random - clairvoyant))
-
-    return stratified_bootstrap({"episodes": np.arange(three.shape[1])}, gap)
+    return _bootstrap(errors[[best, "random_pair", "clairvoyant"]],
+                      lambda mean: (mean[0] - mean[2]) / (mean[1] - mean[2]))
 
 
 def adaptive_ratio(rows: pd.DataFrame) -> tuple[str, str, float, float, float]:
@@ -75,14 +70,17 @@ def adaptive_ratio(rows: pd.DataFrame) -> tuple[str, str, float, float, float]:
     if adaptive is None or open_loop is None:
         raise ValueError("rows must hold an adaptive and an open-loop policy on the same episodes; "
                          f"got {', '.join(map(str, errors))}")
-    two = errors[[adaptive, open_loop]].to_numpy().T
+    return adaptive, open_loop, *_bootstrap(errors[[adaptive, open_loop]],
+                                            lambda mean: mean[0] / mean[1])
 
-    def ratio(episodes: np.ndarray) -> np.ndarray:
-        mean = two[:, episodes.astype(int)].mean(axis=-1)
-        return np.asarray(mean[0] / mean[1])
 
-    return adaptive, open_loop, *stratified_bootstrap(
-        {"episodes": np.arange(two.shape[1])}, ratio)
+def _bootstrap(errors: pd.DataFrame, statistic: Callable[[np.ndarray], Any],
+               ) -> tuple[float, float, float]:
+    """Return a statistic of the columns' means with the ends of its interval over the rows."""
+    table = errors.to_numpy().T
+    return stratified_bootstrap(
+        {"episodes": np.arange(table.shape[1])},
+        lambda episodes: np.asarray(statistic(table[:, episodes.astype(int)].mean(axis=-1))))
 
 
 def gap_text(rows: pd.DataFrame) -> str:

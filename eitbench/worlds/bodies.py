@@ -84,14 +84,10 @@ class ResistiveDisc(Target):
 
     def evolve(self, world: World, episodes: Sequence[EpisodeStreams], truth: Discretisation,
                tick: Callable[[int], object], last: int) -> Iterator[TruthTrajectory]:
-        points = truth.transport.mesh.points
         for episode in episodes:
             path = self.path(world, episode.flow)[:last + 1]
-            disc = np.array([disc_indicator(points, centre, self.radius, TRANSITION_WIDTH)
-                             for centre in path])
             tick(world.n_steps)
-            concentration = self.background + (self.concentration - self.background) * disc
-            yield TruthTrajectory(concentration, np.empty((last, 0)))
+            yield disc_trajectory(self, truth, path, self.radius, np.ones(len(path)))
 
 
 class BodyPath(NamedTuple):
@@ -173,15 +169,10 @@ class WanderingBody(Target):
 
     def evolve(self, world: World, episodes: Sequence[EpisodeStreams], truth: Discretisation,
                tick: Callable[[int], object], last: int) -> Iterator[TruthTrajectory]:
-        points = truth.transport.mesh.points
         for episode in episodes:
-            path = self.path(world, episode.flow)
-            disc = np.array([present * disc_indicator(points, centre, path.radius, TRANSITION_WIDTH)
-                             for centre, present in zip(path.centres[:last + 1], path.present,
-                                                        strict=False)])
+            centres, present, radius = self.path(world, episode.flow)
             tick(world.n_steps)
-            concentration = self.background + (self.concentration - self.background) * disc
-            yield TruthTrajectory(concentration, np.empty((last, 0)))
+            yield disc_trajectory(self, truth, centres[:last + 1], radius, present[:last + 1])
 
 
 @dataclass(frozen=True)
@@ -251,6 +242,17 @@ class Cylinders(Target):
             tick(world.n_steps)
             states = np.repeat(concentration[None], last + 1, axis=0)
             yield TruthTrajectory(states, np.empty((last, 0)))
+
+
+def disc_trajectory(target: ResistiveDisc | WanderingBody, truth: Discretisation,
+                    centres: np.ndarray, radius: float, present: np.ndarray) -> TruthTrajectory:
+    """Return the trajectory of a disc with centres (T + 1, 2) and a radius in m, where it is
+    present (T + 1,)."""
+    points = truth.transport.mesh.points
+    disc = np.array([there * disc_indicator(points, centre, radius, TRANSITION_WIDTH)
+                     for centre, there in zip(centres, present, strict=True)])
+    return TruthTrajectory(target.background + (target.concentration - target.background) * disc,
+                           np.empty((len(centres) - 1, 0)))
 
 
 def reflect(centres: np.ndarray, velocities: np.ndarray,

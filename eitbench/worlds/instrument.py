@@ -152,7 +152,9 @@ class Instrument:
         std = np.hypot(self.noise.std(clean) * faults.noise_factor, self.noise_floor)
         std = self.noise_mismatch * std
         voltages = np.where(broken, self.interference * draws, clean + std * draws)
-        return np.where(self.measurement_mask(currents), voltages, np.nan)
+        if self.readings != "all":
+            voltages[~self.measurement_mask(currents)] = np.nan
+        return voltages
 
     def measurement_mask(self, currents: np.ndarray) -> np.ndarray:
         """Return the mask (..., L) of the electrodes that are measured for currents (..., L)."""

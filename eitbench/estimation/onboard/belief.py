@@ -9,7 +9,7 @@ import numpy as np
 
 from eitbench.data.episode_cache import scoring_constants
 from eitbench.estimation.design import pair_design_criteria
-from eitbench.estimation.onboard.body_belief import BodyBelief
+from eitbench.estimation.onboard.body_belief import BodyBelief, PolicyBelief
 from eitbench.estimation.onboard.linearisation import linearisation_table
 from eitbench.estimation.onboard.reduced_filters import ReducedFilters
 
@@ -23,7 +23,7 @@ FAULT_DECAY = 0.8
 """Factor per step of the score after failed injections, while the electrode is not driven."""
 
 
-class Belief:
+class Belief(PolicyBelief):
     """Covariance of the environment's filter, and the design criteria of each injection.
 
     It is created from the first raw observation of an episode and updated with every later one. The
@@ -56,14 +56,10 @@ class Belief:
         frame = rules.world.currents @ linearisation_table(rules.world).linearisation(0).resistance
         return cls(rules, {"frame": frame, "doubt": np.zeros((2, frame.shape[1]))})
 
-    @classmethod
-    def create_or_update(cls, belief: Belief | None, rules: Rules,
-                         observation: dict[str, np.ndarray]) -> Belief:
-        """Return a new belief from the first observation of an episode, or the updated one."""
-        if belief is None:
-            return cls(rules, observation)
-        belief.update(observation)
-        return belief
+    @staticmethod
+    def suits(rules: Rules) -> bool:
+        """Return whether the filter of these rules has a covariance; otherwise see `BodyBelief`."""
+        return not rules.tracks_body
 
     def update(self, observation: dict[str, np.ndarray]) -> None:
         """Assimilate the outcome of the last injection.
@@ -278,14 +274,9 @@ class Belief:
         return _noise_variance(self.rules, self.linearisation.resistance.tobytes())
 
 
-def create_or_update(belief: Belief | BodyBelief | None, rules: Rules,
-                     observation: dict[str, np.ndarray]) -> Belief | BodyBelief:
-    """Return the belief for these rules after an observation: a new one, if None, or the updated
-    one."""
-    if belief is None:
-        return (BodyBelief if rules.tracks_body else Belief)(rules, observation)
-    belief.update(observation)
-    return belief
+def belief_class(rules: Rules) -> type[Belief] | type[BodyBelief]:
+    """Return the class of a policy's belief for these rules."""
+    return BodyBelief if rules.tracks_body else Belief
 
 
 @lru_cache(maxsize=64)

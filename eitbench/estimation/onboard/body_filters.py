@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 import scipy.sparse as sp
 
-from eitbench.data.episode_cache import score_mass, step_error
 from eitbench.estimation.onboard.episode_filters import EpisodeFilters, Innovation
 from eitbench.estimation.onboard.linearisation import linearisation_table, std_from_variance
 from eitbench.numerics.fem import mass_matrix
@@ -23,7 +22,6 @@ from eitbench.worlds.bodies import (
 )
 
 if TYPE_CHECKING:
-    from eitbench.estimation.onboard.rules import Rules
     from eitbench.worlds.world import World
 
 SPACING = 5e-3
@@ -265,12 +263,6 @@ class BodyFilters(EpisodeFilters):
         mean, std = self._moments(self.model.patches)
         return self.c_ref[:, None] + mean, std
 
-    def errors(self, moments: np.ndarray, deviations: np.ndarray,
-               squares: np.ndarray) -> np.ndarray:
-        world = self._rules.world
-        return step_error(score_mass(world), self.means() - world.background, moments, deviations,
-                          squares)
-
     def means(self) -> np.ndarray:
         return self.c_ref[:, None] + self._moments(self.model.images)[0]
 
@@ -278,17 +270,9 @@ class BodyFilters(EpisodeFilters):
         return self._moments(self.model.images)[1]
 
     def positions(self) -> np.ndarray:
-        """Return the mean positions (B, 2) in m of the particles that are present."""
         weights = self.weights * self.particles.present
         total = np.maximum(weights.sum(axis=1, keepdims=True), 1e-300)
         return np.asarray(((weights / total)[..., None] * self.particles.centres).sum(axis=1))
-
-    def velocity(self) -> None:
-        return None
-
-    @staticmethod
-    def project(rules: Rules, moment: np.ndarray) -> np.ndarray:
-        return np.asarray(moment)
 
 
 def measured_first(measured: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, NamedTuple, Protocol
 
 import numpy as np
 
+from eitbench.data.episode_cache import score_mass, step_error
 from eitbench.estimation.onboard.linearisation import LinearisationTable, linearisation_table
 
 if TYPE_CHECKING:
@@ -80,6 +81,9 @@ class EpisodeFilters(Protocol):
                squares: np.ndarray) -> np.ndarray:
         """Return relative errors (5.12) of the present means, from moments (B, …) after `project`.
         """
+        world = self._rules.world
+        return step_error(score_mass(world), self.means() - world.background, moments, deviations,
+                          squares)
 
     def means(self) -> np.ndarray:
         """Return estimates (B, n) in mol/m³ on the task's mesh."""
@@ -90,8 +94,14 @@ class EpisodeFilters(Protocol):
     def velocity(self) -> tuple[np.ndarray, np.ndarray] | None:
         """Return velocity parameters θ and their standard deviations (B, k) in m/s; None if the
         task specifies the velocity."""
+        return None
+
+    def positions(self) -> np.ndarray | None:
+        """Return the estimated positions (B, 2) of the bodies in m; None without a body."""
+        return None
 
     @staticmethod
     def project(rules: Rules, moment: np.ndarray) -> np.ndarray:
         """Return moments (T, n) over the scored region in the form for `errors`; see
         `eitbench.data.episode_cache.ScoreIntegrals`."""
+        return np.asarray(moment)

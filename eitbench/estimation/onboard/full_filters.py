@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from eitbench.data.episode_cache import score_mass, step_error
 from eitbench.estimation.filter import Filter, StateSpace, Step
 from eitbench.estimation.gaussian import LinearMeasurement
 from eitbench.estimation.inflow_window import InflowWindow
@@ -18,7 +17,6 @@ from eitbench.estimation.onboard.linearisation import linearisation_table, std_f
 from eitbench.estimation.velocity import velocity_states
 
 if TYPE_CHECKING:
-    from eitbench.estimation.onboard.rules import Rules
     from eitbench.worlds.world import World
 
 VELOCITY_BOUNDS = (1 / 3, 2.0)
@@ -82,12 +80,6 @@ class FullFilters(EpisodeFilters):
                              for each in self._filters])
         return mean, self.c_ref[:, None] * std_from_variance(variance)
 
-    def errors(self, moments: np.ndarray, deviations: np.ndarray,
-               squares: np.ndarray) -> np.ndarray:
-        world = self._rules.world
-        estimate = self.means() - world.background
-        return step_error(score_mass(world), estimate, moments, deviations, squares)
-
     def means(self) -> np.ndarray:
         return self.c_ref[:, None] * np.array([each.concentration for each in self._filters])
 
@@ -101,10 +93,6 @@ class FullFilters(EpisodeFilters):
             return None
         theta, variance = (np.array(part) for part in zip(*velocities, strict=True))
         return theta, std_from_variance(variance)
-
-    @staticmethod
-    def project(rules: Rules, moment: np.ndarray) -> np.ndarray:
-        return np.asarray(moment)
 
 
 @lru_cache(maxsize=4)
