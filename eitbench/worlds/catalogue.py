@@ -424,8 +424,9 @@ TANK_TRACKING = World(
     Instrument(noise_relative=3e-3, noise_relative_to_max=3e-4, readings="neighbours"),
     Schedule(time_step=0.025, scored_steps=92, pattern=TankOppositeDiagonalPattern(), warm_up=20),
     Prior(expected_concentration=30.0))
-"""The concentration of the liquid is known, as in difference imaging. The error of the truth's
-voltages by its mesh is up to 0.4 standard deviations of the noise. All numbers [E]."""
+"""The concentration of the liquid is known, as in difference imaging. The mesh of the truth changes
+voltages by 0.1 standard deviations of the noise (median of the pairs), near the wall by up to 0.8
+(``tests/worlds/test_wandering_body.py``). All numbers [E]."""
 SEARCH_AND_TRACK = replace(TANK_TRACKING, name="SearchAndTrack",
                            target=WanderingBody(visit_time=1.0))
 

@@ -3,6 +3,8 @@
 import numpy as np
 import pytest
 from eitbench.data.episodes import simulate
+from eitbench.estimation.onboard.body_filters import body_model
+from eitbench.estimation.onboard.rules import Rules
 from eitbench.worlds import entry
 from eitbench.worlds.bodies import WanderingBody, disc_indicator, reflect
 from eitbench.worlds.instrument import Instrument
@@ -66,6 +68,24 @@ def test_truth_is_the_body_on_its_path():
     for t, concentration in enumerate(episode.concentration):
         expected = 30.0 - 28.5 * path.present[t] * disc_indicator(points, path.centres[t], path.radius, 0.003)
         np.testing.assert_allclose(concentration, expected, rtol=1e-6)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("centre", "median", "worst"), [((0.0, 0.0), 0.1, 0.1), ((0.1, 0.05), 0.1, 0.8)])
+def test_mesh_of_the_truth_resolves_the_body(centre, median, worst):
+    """RMS errors of the measured voltages of each pair against a finer mesh, in noise standard deviations; the worst
+    pair is next to the body. The mesh for larger bodies does not suffice."""
+    def voltages(refinement):
+        truth = TRACKING.with_changes({"vessel": {"truth_refinement": refinement}}).truth_model()
+        disc = disc_indicator(truth.transport.mesh.points, np.array(centre), 0.016, 0.003)
+        return currents @ np.subtract(*truth.observation.transfer_resistance(30.0 - np.outer([28.5, 0.0], disc)))
+
+    currents = Rules(TRACKING).action_currents
+    std = TRACKING.noise.std(currents @ body_model(TRACKING).resistance)
+    std[~TRACKING.instrument.measurement_mask(currents)] = np.nan
+    exact = voltages(4)
+    coarse, errors = (np.sqrt(np.nanmean(((voltages(each) - exact) / std)**2, axis=1)) for each in (1, 2))
+    assert np.median(errors) < median and errors.max() < worst < 1.5 < coarse.max()
 
 
 def test_electrodes_next_to_the_driven_ones_are_measured():
