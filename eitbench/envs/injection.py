@@ -15,7 +15,7 @@ from eitbench.worlds.registry import Entry, entry
 
 
 class InjectionEnv(EpisodeEnv):
-    """Choose the current injections of one episode; a Kalman filter inside makes the estimate.
+    """Choose the current injections of one episode; a filter inside makes the estimate.
 
     ## Action Space
 
