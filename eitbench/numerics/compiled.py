@@ -16,7 +16,7 @@ from eitbench._notice import notify
 
 def compiled_kernels() -> Any:
     """Import `eitbench.numerics.kernels`; ``RuntimeError`` if numba is missing or fails."""
-    _announce_compilation(Path(__file__).with_name("__pycache__"))
+    _announce_compilation()
     try:
         from eitbench.numerics import kernels
     except Exception as error:
@@ -28,8 +28,9 @@ def compiled_kernels() -> Any:
 
 
 @lru_cache(maxsize=1)
-def _announce_compilation(folder: Path) -> None:
-    """Print a message before the first compilation, whose result numba stores in ``folder``."""
+def _announce_compilation() -> None:
+    """Print a message before the first compilation, whose result numba stores in `__pycache__`."""
+    folder = Path(__file__).with_name("__pycache__")
     is_elsewhere = "NUMBA_CACHE_DIR" in os.environ or not os.access(folder.parent, os.W_OK)
     if not is_elsewhere and not any(folder.glob("kernels.*.nbi")):
         notify("compiling the kernels, some 20 s, once after installation; "

@@ -1,5 +1,5 @@
-"""Compiled kernels: sparse Cholesky and LU factors on a fixed pattern, products of gradients, and
-sub-steps of a linear evolution.
+"""Compiled kernels: sparse Cholesky and LU factors on a fixed pattern, products of gradients,
+sub-steps of a linear evolution, and weights of particles.
 
 All code that requires numba is in this file, which `eitbench.numerics.compiled` imports on demand.
 
@@ -460,3 +460,79 @@ def _rest(matrix, i, block):
     for e in range(pointer[i], pointer[i + 1]):
         total = subtract_product(total, splat_wide(value[e]), load_wide(block, index[e] * WIDE))
     return total
+
+
+@njit(cache=True)
+def bilinear_weights(points, spacing, side, index, weights):
+    """Compute grid points ``index`` (N, 4) about ``points`` (N, 2) and their ``weights`` (N, 4), on
+    a grid of side × side points about the origin, x first."""
+    for i in range(len(points)):
+        x = points[i, 0] / spacing + side // 2
+        y = points[i, 1] / spacing + side // 2
+        column = min(max(int(x), 0), side - 2)
+        row = min(max(int(y), 0), side - 2)
+        x -= column
+        y -= row
+        for k in range(4):
+            above, right = k // 2, k % 2
+            index[i, k] = (row + above) * side + column + right
+            weights[i, k] = (x if right else 1.0 - x) * (y if above else 1.0 - y)
+
+
+@njit(cache=True)
+def particle_likelihoods(signals, index, shares, weights, currents, electrodes, measured, residual,
+                         variance, relative_error, logarithm, mean, covariance):
+    """Compute log-likelihoods of particles relative to the density of the noise, (B, P), and
+    ``mean`` (B, m) and ``covariance`` (B, m, m) of their residuals and noise, all zero before.
+
+    Particle p of episode b changes the voltage at electrode e for a current at d by
+    Σ_k shares[b, p, k] signals[L e + d, index[b, p, k]]. ``residual`` and ``variance`` (B, m) are
+    those without a particle; ``relative_error`` is a standard deviation relative to the signal.
+    """
+    B, P, _ = index.shape
+    m = electrodes.shape[1]
+    L = currents.shape[1]
+    deviations = np.empty((P, m))
+    for b in range(B):
+        driven = np.flatnonzero(currents[b])
+        used = np.flatnonzero(measured[b])
+        for p in range(P):
+            growth = 1.0
+            for a in used:
+                signal = 0.0
+                for d in driven:
+                    row = L * electrodes[b, a] + d
+                    for k in range(4):
+                        signal += (currents[b, d] * shares[b, p, k]
+                                   * signals[row, index[b, p, k]])
+                rest = residual[b, a] - signal
+                spread = variance[b, a] + (relative_error * signal)**2
+                logarithm[b, p] -= 0.5 * rest * rest / spread
+                growth *= spread / variance[b, a]
+                deviations[p, a] = rest
+                mean[b, a] += weights[b, p] * rest
+                covariance[b, a, a] += weights[b, p] * spread
+            logarithm[b, p] -= 0.5 * math.log(growth)
+        for p in range(P):
+            for a in used:
+                for c in used:
+                    covariance[b, a, c] += (weights[b, p] * (deviations[p, a] - mean[b, a])
+                                            * (deviations[p, c] - mean[b, c]))
+
+
+@njit(cache=True)
+def add_columns(pointers, rows, values, weights, totals):
+    """Add a sparse matrix by columns times ``weights`` (B, columns) to ``totals`` (B, rows)."""
+    for b in range(len(weights)):
+        for j in range(weights.shape[1]):
+            if weights[b, j] != 0.0:
+                for e in range(pointers[j], pointers[j + 1]):
+                    totals[b, rows[e]] += weights[b, j] * values[e]
+
+
+@njit(cache=True)
+def scatter(index, values, totals):
+    """Add ``values`` (B, N) to ``totals`` (B, G) at ``index`` (B, N)."""
+    for b in range(len(index)):
+        for i in range(index.shape[1]):
+            totals[b, index[b, i]] += values[b, i]

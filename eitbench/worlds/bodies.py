@@ -259,13 +259,15 @@ def reflect(centres: np.ndarray, velocities: np.ndarray,
             limit: float) -> tuple[np.ndarray, np.ndarray]:
     """Return centres (..., 2) in m, and their velocities, after reflection at the circle of radius
     ``limit`` in m."""
-    distance = np.hypot(centres[..., 0], centres[..., 1])[..., None]
-    normal = centres / np.maximum(distance, 1e-12)
-    outward = (velocities * normal).sum(axis=-1, keepdims=True)
-    outside = distance > limit
-    reflected = normal * np.maximum(2.0 * limit - distance, 0.0)
-    return (np.where(outside, reflected, centres),
-            np.where(outside & (outward > 0.0), velocities - 2.0 * outward * normal, velocities))
+    outside = np.hypot(centres[..., 0], centres[..., 1]) > limit
+    beyond, outward = centres[outside], velocities[outside]
+    centres, velocities = centres.copy(), velocities.copy()
+    distance = np.hypot(*beyond.T)[:, None]
+    normal = beyond / distance
+    outward = np.maximum((outward * normal).sum(axis=1, keepdims=True), 0.0)
+    centres[outside] = normal * np.maximum(2.0 * limit - distance, 0.0)
+    velocities[outside] -= 2.0 * outward * normal
+    return centres, velocities
 
 
 def _direction(random: np.random.Generator) -> np.ndarray:

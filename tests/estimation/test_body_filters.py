@@ -45,7 +45,7 @@ def test_signals_are_those_of_the_complete_electrode_model(distance, limit):
     filters = BodyFilters(rules, np.zeros((1, 16, 16)))
     filters.particles.centres[:] = centre
     filters.particles.areas[:] = 1.0
-    index, weights = (each[:, 0, 0] for each in model.cells(filters.particles))
+    index, weights = (each[0, 0] for each in model.cells(filters.particles))
     found = (model.signals[:, index] @ weights).reshape(16, 16)
     scale = (found * expected).sum() / (found**2).sum()          # the effective area is estimated
     assert np.linalg.norm(scale * found - expected) < limit * np.linalg.norm(expected)
@@ -66,13 +66,13 @@ def test_weights_are_those_of_bayes_formula():
     measured = [k for k in ((i - 1) % 16, (i + 1) % 16, (j - 1) % 16, (j + 1) % 16) if k not in (i, j)]
     std = model.table.noise_std(base, 0.0)[measured]
     expected = np.empty(filters.n_particles)
-    index, weights = (each[:, 0] for each in model.cells(filters.particles))
+    index, weights = (each[0] for each in model.cells(filters.particles))
     for p in range(filters.n_particles):
-        change = (model.signals[:, index[:, p]] @ weights[:, p]).reshape(16, 16)
+        change = (model.signals[:, index[p]] @ weights[p]).reshape(16, 16)
         signal = amplitude * (change[:, i] - change[:, j])[measured]
         variance = std**2 + (SIGNAL_ERROR * signal)**2
         residual = core._voltages[0, measured] - base[measured] - signal
-        expected[p] = -0.5 * (residual**2 / variance + np.log(variance)).sum()
+        expected[p] = -0.5 * (residual**2 / variance + np.log(variance / std**2)).sum()
     np.testing.assert_allclose(resampled[0], expected, rtol=1e-9)
     assert np.isnan(np.delete(core._voltages[0], measured)).all()
 
@@ -84,10 +84,10 @@ def test_criteria_are_those_of_a_gaussian_of_images_and_voltages():
     model = filters.model
     gains, information = belief.criteria()
     particles = model.move(filters.particles, np.random.default_rng(1))
-    index, share = (each[:, 0] for each in model.cells(particles))
+    index, share = (each[0] for each in model.cells(particles))
     w = filters.weights[0]
-    images = np.array([model.patches[:, index[:, p]] @ share[:, p] for p in range(len(w))])
-    changes = np.array([model.signals[:, index[:, p]] @ share[:, p] for p in range(len(w))]).reshape(-1, 16, 16)
+    images = np.array([model.patches[:, index[p]] @ share[p] for p in range(len(w))])
+    changes = np.array([model.signals[:, index[p]] @ share[p] for p in range(len(w))]).reshape(-1, 16, 16)
     for pair in (0, 7, 57, 119):
         i, j = rules.pairs[pair]
         current = np.zeros(16)

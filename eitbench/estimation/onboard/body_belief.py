@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import scipy.sparse as sp
 
 from eitbench.estimation.onboard.body_filters import SIGNAL_ERROR, BodyFilters, measured_first
 from eitbench.worlds.bodies import reflect
@@ -37,14 +38,19 @@ class BodyBelief(PolicyBelief):
         self._filters = BodyFilters(rules, observation["frame"][None])
         model = self._filters.model
         L = len(model.resistance)
-        self._images = model.patches.toarray().T
+        entries = np.triu_indices(L)                            # 𝓡 is symmetric
+        number = np.empty((L, L), dtype=int)
+        number[entries] = number.T[entries] = np.arange(len(entries[0]))
+        signals = rules.amplitude * model.signals.reshape(L, L, -1)[entries]
+        self._functionals = np.vstack([signals, model.patches.toarray()]).T.copy()
+        """(G, entries of 𝓡 and patches) of a body at each grid point"""
         pair_currents = rules.action_currents[:len(rules.pairs)]
         mask = rules.instrument.measurement_mask(pair_currents)
         electrodes, self._measured = measured_first(mask)
         std = model.table.noise_std(pair_currents @ model.resistance, rules.instrument.noise_floor)
         self._variance = np.take_along_axis(std**2, electrodes, axis=1)
         source, sink = rules.pairs.T[:, :, None]
-        self._from, self._to = electrodes * L + source, electrodes * L + sink
+        self._from, self._to = number[electrodes, source], number[electrodes, sink]
 
     def update(self, observation: dict[str, np.ndarray]) -> None:
         """Assimilate the outcome of the last injection."""
@@ -66,17 +72,20 @@ class BodyBelief(PolicyBelief):
             moved = particles.centres + centre - weights @ particles.centres[0]
             particles = particles._replace(centres=reflect(moved, moved, model.limit)[0],
                                            present=np.ones_like(particles.present))
-        index, share = (each[:, 0] for each in model.cells(particles))
-        images = np.einsum("kp,kpm->pm", share, self._images[index])
-        P, n_pairs = len(weights), len(self.rules.pairs)
-        signals = np.einsum("kp,ekp->pe", self.rules.amplitude * share, model.signals[:, index])
-        predicted = np.moveaxis(signals[:, self._from] - signals[:, self._to], 0, 1)
-        mean = weights @ predicted
-        root = self._measured / np.sqrt(self._variance + SIGNAL_ERROR**2 * (weights @ predicted**2))
-        scaled = (predicted - mean[:, None]) * root[:, None]
-        weighted = np.swapaxes(weights[:, None] * scaled, 1, 2)
-        S = weighted @ scaled + np.eye(scaled.shape[2])
-        cross = (weighted.reshape(-1, P) @ (images - weights @ images)).reshape(
-            n_pairs, -1, images.shape[1])
-        gains = (cross * np.linalg.solve(S, cross)).sum(axis=(1, 2))
+        index, shares = model.cells(particles)
+        cells = sp.csr_array((shares.ravel(), index.ravel(), np.arange(0, index.size + 1, 4)),
+                             shape=(len(weights), len(self._functionals)))
+        functionals = cells @ self._functionals
+        mean = weights @ functionals
+        deviation = functionals - mean
+        covariance = deviation.T @ (weights[:, None] * deviation)
+        i, j = self._from, self._to
+        S = sum(sign * covariance[one[:, :, None], two[:, None]]
+                for one, two, sign in ((i, i, 1), (i, j, -1), (j, i, -1), (j, j, 1)))
+        second = np.diagonal(S, axis1=1, axis2=2) + (mean[i] - mean[j])**2
+        root = self._measured / np.sqrt(self._variance + SIGNAL_ERROR**2 * second)
+        S = S * root[:, :, None] * root[:, None] + np.eye(root.shape[1])
+        patches = slice(-model.patches.shape[0], None)
+        cross = (covariance[i, patches] - covariance[j, patches]) * root[..., None]
+        gains = (np.linalg.inv(S) * (cross @ np.swapaxes(cross, 1, 2))).sum(axis=(1, 2))
         return gains, 0.5 * np.linalg.slogdet(S)[1]

@@ -11,6 +11,7 @@ import scipy.sparse as sp
 
 from eitbench.estimation.onboard.episode_filters import EpisodeFilters, Innovation
 from eitbench.estimation.onboard.linearisation import linearisation_table, std_from_variance
+from eitbench.numerics.compiled import compiled_kernels
 from eitbench.numerics.fem import mass_matrix
 from eitbench.worlds.bodies import (
     DISC_POINTS,
@@ -79,13 +80,13 @@ class BodyModel:
         contrast = target.concentration / target.background - 1.0
         reference = self.table.linearisation(0)
         self.resistance = reference.resistance
-        self.signals = 2.0 * contrast / (2.0 + contrast) * self._linearised(grid)
+        self.signals = np.ascontiguousarray(
+            2.0 * contrast / (2.0 + contrast) * self._linearised(grid))
         """(L², G) change of 𝓡 by a disc at each grid point"""
         discs[discs < 1e-3] = 0.0
-        self.images = sp.csr_array((contrast * target.background * discs).T)
+        self.images = sp.csc_array((contrast * target.background * discs).T)
         """(n, G) change of the concentration by a disc at each grid point in mol/m³"""
-        # sparse, since the bits of a dense product depend on the number of episodes
-        self.patches = sp.csr_array(self.table.grid_averages @ self.images)
+        self.patches = sp.csc_array(self.table.grid_averages @ self.images)
         """(patches, G) the same on the coarse grid"""
         low, high = target.speed_range
         self.speed = math.sqrt((low**2 + low * high + high**2) / 6.0)
@@ -145,15 +146,14 @@ class BodyModel:
         return Particles(centres, velocities, areas, present)
 
     def cells(self, particles: Particles) -> tuple[np.ndarray, np.ndarray]:
-        """Return the grid points (4, B, P) around each particle, and their bilinear weights, times
+        """Return the grid points (B, P, 4) around each particle, and their bilinear weights, times
         the area; zero for absent ones."""
-        position = particles.centres / SPACING + self.side // 2
-        corner = np.clip(position.astype(int), 0, self.side - 2)
-        x, y = np.moveaxis(position - corner, -1, 0)
-        first = corner[..., 1] * self.side + corner[..., 0]
-        weights = np.stack([(1 - x) * (1 - y), x * (1 - y), (1 - x) * y, x * y])
-        index = np.stack([first, first + 1, first + self.side, first + self.side + 1])
-        return index, weights * (particles.areas * particles.present)
+        shape = (*particles.areas.shape, 4)
+        index, weights = np.empty(shape, dtype=int), np.empty(shape)
+        compiled_kernels().bilinear_weights(particles.centres.reshape(-1, 2), SPACING, self.side,
+                                            index.reshape(-1, 4), weights.reshape(-1, 4))
+        weights *= (particles.areas * particles.present)[..., None]
+        return index, weights
 
 
 class BodyFilters(EpisodeFilters):
@@ -181,47 +181,24 @@ class BodyFilters(EpisodeFilters):
                    currents: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         model = self.model
         self.particles = model.move(self.particles, self._random)
-        self._cells = model.cells(self.particles)
         mask = self._rules.instrument.measurement_mask(currents)
         electrodes, used = measured_first(mask & currents.any(axis=1, keepdims=True))
         base = (currents[:, None] @ model.resistance)[:, 0]     # one product per episode
         std = self.table.noise_std(base, self._rules.instrument.noise_floor)
-        std, residual = (np.take_along_axis(each, electrodes, axis=1)[:, None]
+        std, residual = (np.take_along_axis(each, electrodes, axis=1)
                          for each in (std, voltages - base))
-        signal = self._signals(currents, electrodes)                            # (B, P, m)
-        variance = std**2 + (SIGNAL_ERROR * signal)**2
-        residual = np.where(used[:, None], residual - signal, 0.0)
-        variance = np.where(used[:, None], variance, 1.0)
-        self._last = *self._innovation(residual, variance), used
-        self._reweight(-0.5 * (residual**2 / variance + np.log(variance)).sum(axis=2))
-        innovation, S, _ = self._last
+        log_likelihood = np.zeros(self.weights.shape)
+        innovation = np.zeros(residual.shape)
+        S = ~used[:, None] * np.eye(used.shape[1])
+        compiled_kernels().particle_likelihoods(
+            model.signals, *model.cells(self.particles), self.weights, currents, electrodes, used,
+            residual, std**2, SIGNAL_ERROR, log_likelihood, innovation, S)
+        self._last = innovation, S, used
+        self._reweight(log_likelihood)
         scaled = np.zeros(voltages.shape)
         np.put_along_axis(scaled, electrodes, innovation / np.sqrt(
             S.diagonal(axis1=1, axis2=2)), axis=1)
         return scaled, np.ones(mask.shape, dtype=bool)
-
-    def _signals(self, currents: np.ndarray, electrodes: np.ndarray) -> np.ndarray:
-        """Return the signals (B, P, m) in V of the particles at electrodes (B, m) for currents
-        (B, L)."""
-        index, weights = self._cells
-        L = currents.shape[1]
-        found = np.zeros((*self.weights.shape, electrodes.shape[1]))
-        for b in np.flatnonzero(currents.any(axis=1)):
-            current = currents[b]
-            table = sum(current[d] * self.model.signals[electrodes[b] * L + d]
-                        for d in np.flatnonzero(current))
-            found[b] = np.einsum("kp,mkp->pm", weights[:, b], table[:, index[:, b]])
-        return found
-
-    def _innovation(self, residual: np.ndarray,
-                    variance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return mean (B, m) and covariance (B, m, m) of the predicted residuals."""
-        weights = self.weights[..., None]
-        mean = (weights * residual).sum(axis=1)
-        deviation = residual - mean[:, None]
-        S = np.swapaxes(deviation, 1, 2) @ (weights * deviation)
-        S += (weights * variance).sum(axis=1)[:, None] * np.eye(residual.shape[2])
-        return mean, S
 
     def _reweight(self, log_likelihood: np.ndarray) -> None:
         log_weights = np.log(np.maximum(self.weights, 1e-300)) + log_likelihood
@@ -231,43 +208,48 @@ class BodyFilters(EpisodeFilters):
         P = self.n_particles
         offset = self._random.uniform()
         jitter = POSITION_JITTER * self._random.standard_normal((P, 2))
+        places = (np.arange(P) + offset) / P
         for b in np.flatnonzero((self.weights**2).sum(axis=1) * P > 2.0):
-            chosen = np.searchsorted(self.weights[b].cumsum(), (np.arange(P) + offset) / P)
-            chosen = np.minimum(chosen, P - 1)
+            chosen = np.minimum(np.searchsorted(self.weights[b].cumsum(), places), P - 1)
             for each in self.particles:
-                each[b] = each[b, chosen]
+                each[b] = each[b].take(chosen, axis=0)
             self.particles.centres[b] += jitter
             self.weights[b] = 1.0 / P
 
     def _densities(self) -> np.ndarray:
         """Return the posterior means (2, B, G) on the grid of a body's area, and of its square."""
-        index, weights = self.model.cells(self.particles)
-        B, G = len(self.weights), self.model.signals.shape[1]
-        flat = (index + G * np.arange(B)[:, None]).ravel()
-        return np.array([
-            np.bincount(flat, (weights * self.weights * factor).ravel(), B * G).reshape(B, G)
-            for factor in (1.0, self.particles.areas)])
+        index, shares = self.model.cells(self.particles)
+        densities = np.zeros((2, len(self.weights), self.model.signals.shape[1]))
+        flat = index.reshape(len(self.weights), -1)
+        for density, factor in zip(densities, (1.0, self.particles.areas), strict=True):
+            values = shares * (self.weights * factor)[..., None]
+            compiled_kernels().scatter(flat, values.reshape(flat.shape), density)
+        return densities
 
     def innovations(self) -> list[Innovation | None]:
         return [Innovation.of(*each) for each in zip(*self._last, strict=True)]
 
-    def _moments(self, images: sp.csr_array) -> tuple[np.ndarray, np.ndarray]:
-        """Return mean and standard deviation (B, m) of functionals of the body."""
+    def _expectations(self, images: sp.csc_array, moment: int) -> np.ndarray:
+        """Return the expectation (B, m) of functionals of the body to the power of ``moment``."""
         if self._density is None:
             self._density = self._densities()
-        first, second = self._density
-        mean = np.ascontiguousarray((images @ first.T).T)   # bits of later sums depend on it
-        return mean, std_from_variance((images**2 @ second.T).T - mean**2)
+        found = np.zeros((len(self.weights), images.shape[0]))
+        compiled_kernels().add_columns(images.indptr, images.indices, images.data**moment,
+                                       self._density[moment - 1], found)
+        return found
+
+    def _std(self, images: sp.csc_array, mean: np.ndarray) -> np.ndarray:
+        return std_from_variance(self._expectations(images, 2) - mean**2)
 
     def coarse_grid(self) -> tuple[np.ndarray, np.ndarray]:
-        mean, std = self._moments(self.model.patches)
-        return self.c_ref[:, None] + mean, std
+        mean = self._expectations(self.model.patches, 1)
+        return self.c_ref[:, None] + mean, self._std(self.model.patches, mean)
 
     def means(self) -> np.ndarray:
-        return self.c_ref[:, None] + self._moments(self.model.images)[0]
+        return self.c_ref[:, None] + self._expectations(self.model.images, 1)
 
     def stds(self) -> np.ndarray:
-        return self._moments(self.model.images)[1]
+        return self._std(self.model.images, self._expectations(self.model.images, 1))
 
     def positions(self) -> np.ndarray:
         weights = self.weights * self.particles.present
