@@ -28,6 +28,8 @@ KEY_DESCRIPTIONS = {
              "and of injections through the electrode",
     "velocity": "estimated mean velocity, m/s",
     "velocity_std": "standard deviation of the velocity, m/s",
+    "body": "estimate of the body, if present: x, y in m; velocity x, y in m/s; standard "
+            "deviations of x, y in m; correlation; relative area; probability of presence",
     "left": "remaining steps and, with a budget, remaining injections",
 }
 """Meaning of each entry of an observation."""

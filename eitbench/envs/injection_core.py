@@ -11,7 +11,7 @@ from gymnasium import spaces
 from eitbench import _check
 from eitbench.data.episode_cache import instrument_faults, integrals, score_mass, scoring_constants
 from eitbench.envs.episodes import EpisodeCore, Observation
-from eitbench.estimation.onboard.episode_filters import Innovation
+from eitbench.estimation.onboard.episode_filters import BODY, Innovation
 from eitbench.estimation.onboard.onboard_filter import OnboardFilter, filters_class
 from eitbench.estimation.onboard.rules import Rules
 from eitbench.worlds.instrument import Faults
@@ -32,7 +32,7 @@ def flatten_scaled(rules: Rules, observation: Observation) -> np.ndarray:
 
     In this order: voltages, recent currents, innovations, mean and std on the grid, fault scores,
     remaining steps and, with a budget, injections, and if the velocity is estimated, its mean and
-    standard deviation; the first frame is omitted.
+    standard deviation, and if a body is tracked, its estimate; the first frame is omitted.
     """
     world = rules.world
     level = world.expected_concentration
@@ -46,6 +46,10 @@ def flatten_scaled(rules: Rules, observation: Observation) -> np.ndarray:
     if flow is not None:
         parts += [2.0 * (observation["velocity"] / flow.nominal - 1.0),
                   observation["velocity_std"] / flow.initial_std]
+    if rules.tracks_body:
+        length, speed = world.vessel.radius, world.target.speed_range[1]
+        spread = world.target.radius_range[1]
+        parts.append(observation["body"] / ([length] * 2 + [speed] * 2 + [spread] * 2 + [1.0] * 3))
     batch = observation["voltages"].shape[:-1]
     flat = np.concatenate([part.reshape(*batch, -1) for part in parts], axis=-1)
     return np.clip(flat, -MAX_SCALED, MAX_SCALED).astype(np.float32)
@@ -106,6 +110,8 @@ class InjectionCore(EpisodeCore):
                 fastest = 100.0 * max(flow.nominal)
                 shown |= {"velocity": _box(fastest, flow.n_parameters),
                           "velocity_std": _box(fastest, flow.n_parameters, low=0.0)}
+            if rules.tracks_body:
+                shown["body"] = _box(1e3, len(BODY))
         left = [world.n_steps] if rules.budget is None else [world.n_steps, rules.budget]
         shown["left"] = spaces.Box(np.zeros(len(left)), np.array(left, dtype=float),
                                    dtype=np.float64)
@@ -235,7 +241,8 @@ class InjectionCore(EpisodeCore):
 
     def positions(self) -> np.ndarray | None:
         """Return the estimated positions (B, 2) of the bodies in m; None without a body."""
-        return self._filters.positions()
+        body = self._filters.body()
+        return None if body is None else body[:, :2]
 
     def action_masks(self) -> np.ndarray:
         """Return (B, actions) bool: actions that have an effect. When the budget is used up, only

@@ -53,7 +53,8 @@ def test_signals_are_those_of_the_complete_electrode_model(distance, limit):
 
 
 def test_weights_are_those_of_bayes_formula():
-    """One measurement from equal weights: the likelihood of each particle's voltages at the measured electrodes."""
+    """One measurement from equal weights: the likelihood of each particle's voltages at the measured electrodes,
+    relative to the density of the noise, and the moments of the innovation."""
     core, _ = believed()
     filters, rules = core._filters, core.rules
     filters.weights[:] = 1.0 / filters.n_particles
@@ -66,14 +67,22 @@ def test_weights_are_those_of_bayes_formula():
     measured = [k for k in ((i - 1) % 16, (i + 1) % 16, (j - 1) % 16, (j + 1) % 16) if k not in (i, j)]
     std = model.table.noise_std(base, 0.0)[measured]
     expected = np.empty(filters.n_particles)
+    residuals, variances = [], []
     index, weights = (each[0] for each in model.cells(filters.particles))
     for p in range(filters.n_particles):
         change = (model.signals[:, index[p]] @ weights[p]).reshape(16, 16)
         signal = amplitude * (change[:, i] - change[:, j])[measured]
         variance = std**2 + (SIGNAL_ERROR * signal)**2
         residual = core._voltages[0, measured] - base[measured] - signal
+        residuals.append(residual)
+        variances.append(variance)
         expected[p] = -0.5 * (residual**2 / variance + np.log(variance / std**2)).sum()
     np.testing.assert_allclose(resampled[0], expected, rtol=1e-9)
+    (innovation,) = filters.innovations()
+    order = [sorted(measured).index(k) for k in measured]
+    np.testing.assert_allclose(innovation.value[order], np.mean(residuals, axis=0), rtol=1e-9, atol=1e-12)
+    S = np.cov(np.transpose(residuals), bias=True) + np.diag(np.mean(variances, axis=0))
+    np.testing.assert_allclose(innovation.covariance[np.ix_(order, order)], S, rtol=1e-9, atol=1e-15)
     assert np.isnan(np.delete(core._voltages[0], measured)).all()
 
 

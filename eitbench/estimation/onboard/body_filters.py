@@ -251,10 +251,19 @@ class BodyFilters(EpisodeFilters):
     def stds(self) -> np.ndarray:
         return self._std(self.model.images, self._expectations(self.model.images, 1))
 
-    def positions(self) -> np.ndarray:
-        weights = self.weights * self.particles.present
-        total = np.maximum(weights.sum(axis=1, keepdims=True), 1e-300)
-        return np.asarray(((weights / total)[..., None] * self.particles.centres).sum(axis=1))
+    def body(self) -> np.ndarray:
+        centres, velocities, areas, present = self.particles
+        weights = self.weights * present
+        presence = weights.sum(axis=1)
+        weights = (weights / np.maximum(presence, 1e-300)[:, None])[..., None]
+        mean, velocity, area = ((weights * each).sum(axis=1)
+                                for each in (centres, velocities, areas[..., None]))
+        deviation = centres - mean[:, None]
+        std = np.sqrt((weights * deviation**2).sum(axis=1)) + 1e-12
+        product = (weights[..., 0] * deviation[..., 0] * deviation[..., 1]).sum(axis=1)
+        correlation = product / std.prod(axis=1)
+        return np.concatenate([mean, velocity, std, correlation[:, None], area, presence[:, None]],
+                              axis=1)
 
 
 def measured_first(measured: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

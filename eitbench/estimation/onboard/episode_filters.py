@@ -13,6 +13,11 @@ if TYPE_CHECKING:
     from eitbench.estimation.onboard.rules import Rules
 
 
+BODY = ("x, m", "y, m", "velocity x, m/s", "velocity y, m/s", "std of x, m", "std of y, m",
+        "correlation of x and y", "area relative to the mean", "probability of presence")
+"""Estimate of a body, given that it is present."""
+
+
 class Innovation(NamedTuple):
     """Innovation of the m measurements that a filter accepted."""
 
@@ -96,8 +101,8 @@ class EpisodeFilters(Protocol):
         task specifies the velocity."""
         return None
 
-    def positions(self) -> np.ndarray | None:
-        """Return the estimated positions (B, 2) of the bodies in m; None without a body."""
+    def body(self) -> np.ndarray | None:
+        """Return the estimated `BODY` of each episode, (B, 9); None without a body."""
         return None
 
     @staticmethod

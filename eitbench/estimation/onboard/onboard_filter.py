@@ -72,10 +72,13 @@ class OnboardFilter:
 
     def features(self) -> dict[str, np.ndarray]:
         """Return innovations (B, L) in predicted standard deviations, mean and std (B, patches) in
-        mol/m³, the fault scores doubt (B, 2, L), and, if estimated, velocity and its std in m/s."""
+        mol/m³, the fault scores doubt (B, 2, L), and, if estimated, velocity and its std in m/s, or
+        `BODY`."""
         mean, std = self.filters.coarse_grid()
         shown = {"innovations": self._innovations.copy(), "mean": mean, "std": std,
                  "doubt": self._doubt.copy()}
         if (flow := self.filters.velocity()) is not None:
             shown |= {"velocity": flow[0], "velocity_std": flow[1]}
+        if (body := self.filters.body()) is not None:
+            shown["body"] = body
         return shown
