@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -91,8 +91,8 @@ class VesselConfig:
         return self.shape.n_electrodes
 
     def transport_mesh(self) -> Mesh:
-        """Return the mesh of the estimates."""
-        return self._rotate_mesh(self.shape.transport_mesh(fine=False)[0])
+        """Return the mesh of the estimates, the same object for equal vessels."""
+        return _transport_mesh(self.shape, self.first_electrode_deg, self.direction)
 
     def electrode_model(self, contact_impedance: np.ndarray | float) -> CompleteElectrodeModel:
         """Return the electrodes with these contact impedances, (L,) or a scalar, in Ω·m²."""
@@ -102,20 +102,28 @@ class VesselConfig:
     def _electrodes(self) -> CompleteElectrodeModel:
         # finer than estimates need, as calibration corrects its error for homogeneous fluid only
         model = self.shape.electrode_model(fine=self.shape.transport_mesh(fine=False)[0].dim == 2)
-        mesh = self._rotate_mesh(model.mesh)
+        mesh = _rotate_mesh(model.mesh, self.first_electrode_deg, self.direction)
         return model if mesh is model.mesh else CompleteElectrodeModel(
             mesh, model.electrodes, model.contact_impedance, model.order)
 
-    def _rotate_mesh(self, mesh: Mesh) -> Mesh:
-        """Mirror a mesh at y = 0 if electrodes are numbered clockwise, then rotate it."""
-        if self.first_electrode_deg == 0.0 and self.direction == NUMBERING_DIRECTIONS[0]:
-            return mesh
-        angle = np.radians(self.first_electrode_deg)
-        mirror = 1.0 if self.direction == NUMBERING_DIRECTIONS[0] else -1.0
-        points = mesh.points.copy()
-        points[:, :2] = mesh.points[:, :2] @ [[np.cos(angle), np.sin(angle)],
-                                              [-mirror * np.sin(angle), mirror * np.cos(angle)]]
-        return Mesh(points, mesh.cells)
+
+@lru_cache(maxsize=4)
+def _transport_mesh(shape: Any, first_electrode_deg: float, direction: str) -> Mesh:
+    """Build the mesh of the estimates once per process, since priors are cached by mesh."""
+    mesh, _ = shape.transport_mesh(fine=False)
+    return _rotate_mesh(mesh, first_electrode_deg, direction)
+
+
+def _rotate_mesh(mesh: Mesh, first_electrode_deg: float, direction: str) -> Mesh:
+    """Mirror a mesh at y = 0 if electrodes are numbered clockwise, then rotate it."""
+    if first_electrode_deg == 0.0 and direction == NUMBERING_DIRECTIONS[0]:
+        return mesh
+    angle = np.radians(first_electrode_deg)
+    mirror = 1.0 if direction == NUMBERING_DIRECTIONS[0] else -1.0
+    points = mesh.points.copy()
+    points[:, :2] = mesh.points[:, :2] @ [[np.cos(angle), np.sin(angle)],
+                                          [-mirror * np.sin(angle), mirror * np.cos(angle)]]
+    return Mesh(points, mesh.cells)
 
 
 def read_vessel(source: Path | str | Mapping[str, Any]) -> VesselConfig:
