@@ -16,11 +16,10 @@ from eitbench.bench.ranking import agent_name
 from eitbench.bench.runner import cached_environment, is_compatible
 from eitbench.bench.text import mean_and_interval
 from eitbench.bench.tracks import Environment, builtin_ids, track_of
+from eitbench.report.policies import OPEN_LOOP
 
 SEEDS = "dev:0-31"
 FILE = PACKAGE / "worlds" / "returns.csv"
-OPEN_LOOP = ("adjacent", "opposite", "transverse", "schedule", "best_pair", "best_cycle",
-             "best_currents")
 GROUPS = ("random", "open loop", "adaptive", "trained agents")
 
 

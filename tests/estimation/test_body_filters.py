@@ -112,6 +112,21 @@ def test_criteria_are_those_of_a_gaussian_of_images_and_voltages():
         assert information[pair] == pytest.approx(0.5 * np.linalg.slogdet(S @ np.linalg.inv(R))[1], rel=1e-6)
 
 
+def test_body_has_the_moments_of_the_particles_that_are_present():
+    core, _ = believed("eitbench/SearchAndTrack-v0")
+    filters, random = core._filters, np.random.default_rng(0)
+    filters.weights[:] = random.dirichlet(np.ones(filters.n_particles))
+    filters.particles.present[:] = random.uniform(size=filters.n_particles) < 0.3
+    present = filters.particles.present[0]
+    centres, velocities, areas = (each[0, present] for each in filters.particles[:3])
+    w = filters.weights[0, present]
+    S = np.cov(centres.T, aweights=w, bias=True)
+    std = np.sqrt(np.diag(S))
+    expected = [*np.average(centres, axis=0, weights=w), *np.average(velocities, axis=0, weights=w), *std,
+                S[0, 1] / std.prod(), np.average(areas, weights=w), w.sum()]
+    np.testing.assert_allclose(core.observe()["body"][0], expected, rtol=1e-9)
+
+
 @pytest.mark.parametrize("id", [ID, "eitbench/SearchAndTrack-v0"])
 def test_belief_is_the_filter_inside(id):
     """A belief that a policy updates equals the environment's filter, to the bit."""
