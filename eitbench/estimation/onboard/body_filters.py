@@ -259,9 +259,9 @@ class BodyFilters(EpisodeFilters):
         mean, velocity, area = ((weights * each).sum(axis=1)
                                 for each in (centres, velocities, areas[..., None]))
         deviation = centres - mean[:, None]
-        std = np.sqrt((weights * deviation**2).sum(axis=1)) + 1e-12
+        std = np.sqrt((weights * deviation**2).sum(axis=1))
         product = (weights[..., 0] * deviation[..., 0] * deviation[..., 1]).sum(axis=1)
-        correlation = product / std.prod(axis=1)
+        correlation = product / np.maximum(std.prod(axis=1), 1e-300)
         return np.concatenate([mean, velocity, std, correlation[:, None], area, presence[:, None]],
                               axis=1)
 
