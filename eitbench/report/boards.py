@@ -37,6 +37,7 @@ from eitbench.bench.statistics import (
 from eitbench.bench.text import scores_by_seed, seed_ranges
 from eitbench.bench.variants import flatten, format_setting
 from eitbench.scoring import normalised_score
+from eitbench.worlds.registry import entries
 
 ALL = "all"
 """Name of the environment in the rows of an aggregate."""
@@ -401,8 +402,17 @@ def _with_interval(name: str, values: dict[str, dict[str, float]],
 
 def aggregate_environments() -> set[str]:
     """Return the names of the environments of aggregates: all registered ids with their default
-    arguments, without shifted environments, which have a separate leaderboard."""
-    return {tracks.environment_name(id, {}) for id in tracks.ids() if not tracks.nominal_id(id)}
+    arguments, without shifted environments, which have a separate leaderboard, and without
+    `reference_environments`."""
+    names = {tracks.environment_name(id, {}) for id in tracks.ids() if not tracks.nominal_id(id)}
+    return names - reference_environments()
+
+
+def reference_environments() -> set[str]:
+    """Return the names of the environments in which no known policy is better than fixed
+    injections."""
+    return {tracks.environment_name(each.id, {}) for each in entries().values()
+            if each.is_reference}
 
 
 def _aggregate_boards(made: list[Leaderboard]) -> list[Leaderboard]:

@@ -181,7 +181,9 @@ def load_agent(path: Path, content: bytes) -> tuple[str, str, type[AgentPolicy],
     is_built_in = built_in.is_file() and built_in.read_text().split()[:1] == [found]
     mark = "" if is_built_in else f"_{configuration_hash(asked)}"
     parameters = {"env": asked["env"], **asked["config"]}
-    return f"{algo}{mark}_seed{seed}", f"{algo} trained with seed {seed}", policy, parameters
+    teacher = parameters.get("imitate", {}).get("teacher")
+    kind = f"imitation of {teacher}" if teacher and not parameters["total_steps"] else algo
+    return f"{algo}{mark}_seed{seed}", f"{kind} trained with seed {seed}", policy, parameters
 
 
 def configuration_hash(asked: dict[str, Any]) -> str:

@@ -295,21 +295,22 @@ Kalman filter inside the environment processes the voltages and estimates the co
 agents use the same filter, so that they differ only in their injections.
 """
 
-register_injection(PIPE_2D, "eitbench/Pipe2DInjection-v0", description=f"""{INJECTION_TEXT}
+register_injection(PIPE_2D, "eitbench/Pipe2DInjection-v0", is_reference=True,
+                   description=f"""{INJECTION_TEXT}
 This environment is a reference case, not a competition: no policy is better than one pair near the
 inlet, injected all the time (the flow carries the information from the inlet through the whole
 pipe), and the best injection does not depend on the data. The normalised adaptivity gap is zero
 (`docs/injection.md`).
 """)
 register_injection(PIPE_2D, "eitbench/Pipe2DInjectionInflow-v0", inflow="learned",
-                   description=f"""{INJECTION_TEXT}
+                   is_reference=True, description=f"""{INJECTION_TEXT}
 The filter uses a prior of duration and width of slugs that is fitted to training inflows
 (`docs/methods.md`, 10), and linearises about each prediction; in `eitbench/Pipe2DInjection-v0` its
 inflow is white noise, Table 5.1. With the best pair at the inlet the error is one seventh of the
 error there. This environment is a reference case too: the normalised adaptivity gap is zero
 (`docs/injection.md`).
 """)
-register_injection(PIPE_2D_CURRENTS, "eitbench/Pipe2DInjectionCurrents-v0",
+register_injection(PIPE_2D_CURRENTS, "eitbench/Pipe2DInjectionCurrents-v0", is_reference=True,
                    description=f"""{INJECTION_TEXT}
 The action is a current for each electrode. This environment is a reference case: the best currents,
 the same at every step, reduce ẽ_c by a tenth relative to pairs; the clairvoyant policy is not
@@ -406,7 +407,8 @@ outperforms random pairs, which are as good as the best cycle; trained agents do
 
 # -- Stirred tank in which an agent injects --
 
-register_injection(ROTATING_TANK_2D, "eitbench/RotatingTankInjection-v0", description="""
+register_injection(ROTATING_TANK_2D, "eitbench/RotatingTankInjection-v0", is_reference=True,
+                   description="""
 The stirred tank of `eitbench/RotatingTank2D-v0`: the flow carries a ball with a low conductivity on
 an unknown path, and the agent chooses the pair of electrodes that injects. The filter inside has
 the flow of the liquid and no model of the ball. The first frame is one injection of 0 → 8.

@@ -58,6 +58,9 @@ class Entry:
     """one of `GROUPS`"""
     is_starting_point: bool = False
     """whether new users should begin with this environment"""
+    is_reference: bool = False
+    """whether no known policy is better than fixed injections: its leaderboard is on its page only,
+    and its scores are not in aggregates"""
 
     @property
     def variant(self) -> str:
@@ -81,7 +84,8 @@ _runtime_ids: set[str] = set()
 
 def register(world: World, id: str, *, track: str = "estimation", description: str = "",
              test_seeds: str = "test:0-9", nominal: str = "", group: str = "user-defined",
-             is_starting_point: bool = False, **settings: Any) -> None:
+             is_starting_point: bool = False, is_reference: bool = False,
+             **settings: Any) -> None:
     """Register a world under an id, for `gymnasium.make` and for runs.
 
     Parameters
@@ -102,6 +106,8 @@ def register(world: World, id: str, *, track: str = "estimation", description: s
         One of `GROUPS`, for lists of environments.
     is_starting_point : bool
         Recommend this environment to new users in lists.
+    is_reference : bool
+        Show its leaderboard on its page only, and omit it in aggregates.
     settings
         ``lag`` and ``assume`` of estimation, ``gate`` and ``inflow`` of injection.
 
@@ -127,7 +133,7 @@ def register(world: World, id: str, *, track: str = "estimation", description: s
     except (TypeError, ValueError) as error:
         raise ValueError(f"settings must be fit for JSON: {error}") from None
     entry = Entry(id, world, track, settings, **texts, group=group,
-                  is_starting_point=is_starting_point)
+                  is_starting_point=is_starting_point, is_reference=is_reference)
     if entry.nominal:
         _check_same_task(entry)
     taken = _entries[id] != entry if id in _entries else id in gym.registry

@@ -37,6 +37,7 @@ from eitbench.report.boards import (
     headings,
     leaderboard_table,
     leaderboards,
+    reference_environments,
 )
 from eitbench.report.site import measured, robustness
 from eitbench.report.templates import markdown, markdown_list, render_template
@@ -201,9 +202,13 @@ class Headline(NamedTuple):
 
 def index_page(site: Site) -> bytes:
     """Return the HTML of ``index.html``."""
+    apart = reference_environments()
     shown = {name: [(board, tables.page_table(board, "", compact=True),
-                     tables.ScoreAxes.of(board).headers()) for board in boards]
+                     tables.ScoreAxes.of(board).headers()) for board in boards
+                    if board.environment not in apart]
              for name, boards in site.classes.items()}
+    references = {name: [board for board in boards if board.environment in apart]
+                  for name, boards in site.classes.items()}
     top = headline(site)
     return site.page(
         "index", headline=top, figures=[*([top.figure] if top else []), *key_figures(site)],
@@ -211,7 +216,7 @@ def index_page(site: Site) -> bytes:
         n_environments=sum(not board.is_aggregate for board in site.boards),
         n_records=len(site.records),
         n_methods=len({record["method"] for record in site.records}), classes=shown,
-        about=CATEGORY_TEXTS,
+        references=references, about=CATEGORY_TEXTS,
         robustness=ROBUSTNESS_PAGE if robustness.shift_families(site.boards) else "",
         measured=MEASURED_PAGE if site.measured.records else "",
         last=max(map(finished_at, site.records), default="")[:10],
