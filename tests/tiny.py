@@ -22,7 +22,7 @@ RUN = {"command": "eitbench run", "blas": "scipy-openblas", "commit": "c0ffee", 
 MARKS = ("homogeneous", "random_pair", "true_model_smoother")
 """Naive baselines and the oracle."""
 BOARD_IDS = {"filter": "eitbench/Pipe2D-v0", "fixed-lag": "eitbench/Pipe2DFixedLag-v0",
-             "smoothing": "eitbench/Pipe2DSmoothing-v0", "injection": "eitbench/Pipe2DInjection-v0"}
+             "smoothing": "eitbench/Pipe2DSmoothing-v0", "injection": "eitbench/Pipe2DInjectionFaults-v0"}
 
 SOURCE = '''"""{doc}"""
 import os

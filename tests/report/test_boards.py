@@ -122,6 +122,15 @@ def test_aggregate_of_a_class():
     assert total["error"].isna().all() and not total["official"].any()
 
 
+def test_reference_environments_are_not_in_aggregates():
+    """Where no policy is better than fixed injections, scores would only level the others."""
+    ids = [f"eitbench/Pipe2DInjection{name}-v0" for name in ("Faults", "Budget", "")]
+    records = [record(method, [error] * 8, id=id, board="injection", role=role) for id in ids
+               for method, error, role in (("random_pair", 0.2, "floor"), ("mine", 0.1 if id != ids[2] else 0.3, None))]
+    total = boards(records).query("environment == @ALL").set_index("method")
+    assert total["gain"]["mine"] == pytest.approx(0.5)
+
+
 def test_an_aggregate_is_ranked_by_what_orders_it():
     """Aggregates use the interquartile mean of skill scores, which is robust to outliers; environments use the mean."""
     def made(gains):

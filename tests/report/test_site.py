@@ -125,6 +125,15 @@ def test_numbers_are_those_of_the_boards(pages):
     assert [rank for rank in ranks if rank.startswith("1")] == ["1 tied", "1 tied"]
 
 
+def test_reference_environments_have_their_tables_on_their_pages_only():
+    """The index names and links them."""
+    id = "eitbench/Pipe2DInjection-v0"
+    pages = rendered([*several_boards(), record("greedy_a", [0.1, 0.2], id=id, board="injection")])
+    page = "environments/eitbench-Pipe2DInjection-v0.html"
+    assert rows_of(pages[page], "<h2>Leaderboard</h2>") and f'href="{page}"' in pages["index.html"]
+    assert 'id="board-injection-eitbench-Pipe2DInjection-v0"' not in pages["index.html"]
+
+
 def test_a_methods_page_has_every_episode_and_its_provenance(pages):
     """A method's page has recorded seeds, errors, failures, parameters, commands, and each machine once."""
     html = pages["methods/failing.html"]

@@ -23,7 +23,7 @@ from tiny import record, several_boards
 CHROMIUM = next(filter(None, map(shutil.which, (
     "chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "chrome"))), None)
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="Chromium and Chrome are not on the PATH")
-BOARD, AGENTS = "#board-filter-eitbench-Pipe2D-v0", "#board-injection-eitbench-Pipe2DInjection-v0"
+BOARD, AGENTS = "#board-filter-eitbench-Pipe2D-v0", "#board-injection-eitbench-Pipe2DInjectionFaults-v0"
 ENVIRONMENT, METHOD = "environments/eitbench-Pipe2D-v0.html", "methods/a.html"
 """One page of each kind, besides the index."""
 DARK = "--blink-settings=preferredColorScheme=0"
