@@ -123,7 +123,7 @@ def test_aggregate_of_a_class():
 
 
 def test_reference_environments_are_not_in_aggregates():
-    """Where no policy is better than fixed injections, scores would only level the others."""
+    """Their scores, in which no policy is better than fixed injections, would only level the others."""
     ids = [f"eitbench/Pipe2DInjection{name}-v0" for name in ("Faults", "Budget", "")]
     records = [record(method, [error] * 8, id=id, board="injection", role=role) for id in ids
                for method, error, role in (("random_pair", 0.2, "floor"), ("mine", 0.1 if id != ids[2] else 0.3, None))]
