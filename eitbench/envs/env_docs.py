@@ -13,6 +13,7 @@ from typing import Any
 import gymnasium as gym
 from gymnasium import spaces
 
+from eitbench.estimation.onboard.episode_filters import BODY
 from eitbench.worlds.registry import entry, published_returns
 from eitbench.worlds.world import World
 
@@ -28,8 +29,7 @@ KEY_DESCRIPTIONS = {
              "and of injections through the electrode",
     "velocity": "estimated mean velocity, m/s",
     "velocity_std": "standard deviation of the velocity, m/s",
-    "body": "estimate of the body, if present: x, y in m; velocity x, y in m/s; standard "
-            "deviations of x, y in m; correlation; relative area; probability of presence",
+    "body": f"estimate of the body, given that it is present: {'; '.join(BODY)}",
     "left": "remaining steps and, with a budget, remaining injections",
 }
 """Meaning of each entry of an observation."""
