@@ -17,7 +17,7 @@ import eitbench  # noqa: F401 (registers the environments)
 from eitbench.data.seeds import parse_seeds
 from eitbench.worlds.registry import published_returns
 
-ID = "eitbench/TankTracking-v0"
+ID = "eitbench/Pipe2DInjectionFaults-v0"
 SEEDS = (0, 1, 2)
 STEPS = 100_000
 EVALUATION_INTERVAL = 10_000
