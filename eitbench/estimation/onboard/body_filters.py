@@ -254,15 +254,15 @@ class BodyFilters(EpisodeFilters):
     def body(self) -> np.ndarray:
         centres, velocities, areas, present = self.particles
         weights = self.weights * present
-        presence = weights.sum(axis=1)
-        weights = (weights / np.maximum(presence, 1e-300)[:, None])[..., None]
-        mean, velocity, area = ((weights * each).sum(axis=1)
-                                for each in (centres, velocities, areas[..., None]))
-        deviation = centres - mean[:, None]
-        std = np.sqrt((weights * deviation**2).sum(axis=1))
-        product = (weights[..., 0] * deviation[..., 0] * deviation[..., 1]).sum(axis=1)
-        correlation = product / np.maximum(std.prod(axis=1), 1e-300)
-        return np.concatenate([mean, velocity, std, correlation[:, None], area, presence[:, None]],
+        presence = weights.sum(axis=1, keepdims=True)
+        weights = weights[:, None] / np.maximum(presence, 1e-300)[:, None]          # (B, 1, P)
+        position, velocity, area = ((weights @ each)[:, 0]
+                                    for each in (centres, velocities, areas[..., None]))
+        deviation = np.swapaxes(centres - position[:, None], 1, 2)
+        covariance = (weights * deviation) @ np.swapaxes(deviation, 1, 2)
+        std = np.sqrt(covariance.diagonal(axis1=1, axis2=2))
+        correlation = covariance[:, 0, 1] / np.maximum(std.prod(axis=1), 1e-300)
+        return np.concatenate([position, velocity, std, correlation[:, None], area, presence],
                               axis=1)
 
 
