@@ -183,9 +183,11 @@ def test_failed_estimates_are_in_evaluations(monkeypatch):
 
 
 def test_imitation_learns_the_teachers_actions(tmp_path):
-    """After imitation alone the agent has the teacher's actions: here always the same pair."""
+    """After imitation alone the agent has the teacher's actions, here always the same pair, and its title names it."""
     config = replace(TINY, total_steps=0, imitate={"teacher": "best_pair", "rounds": 2, "episodes": 3, "epochs": 60})
-    model = ALGORITHMS["ppo"].load(train(NAME, "ppo", config, 0, tmp_path, SHORT))
+    path = train(NAME, "ppo", config, 0, tmp_path, SHORT)
+    model = ALGORITHMS["ppo"].load(path)
+    assert load_agent(path, path.read_bytes())[1] == "imitation of best_pair trained with seed 0"
     observation, _ = gym.make(NAME, **SHORT).reset(seed=2)
     assert int(model.predict(observation, deterministic=True)[0]) == 7
 
