@@ -221,7 +221,7 @@ def nodal(transport) -> Filter:
     model, level = transport.evolution_model(), PIPE_2D.expected_concentration
     noise = level**2 * model.state_noise_covariance(PIPE_2D.prior.inflow_std**2,
                                                     PIPE_2D.prior.nodal_std**2)
-    covariance = LowRankCovariance(OpenLoopCovariance(model.F, noise), 1e-4)
+    covariance = LowRankCovariance(OpenLoopCovariance.of(model.F, noise), 1e-4)
     forcing = level * model.Y.sum(axis=1)
     return Filter(NodalStates(np.full(len(noise), level), covariance, Motion(model.F, forcing)))
 

@@ -189,6 +189,14 @@ def _digest(configuration: Any) -> str:
     return hashlib.sha256(json.dumps(configuration, sort_keys=True).encode()).hexdigest()
 
 
+def array_digest(*arrays: np.ndarray) -> str:
+    """Return a digest of the contents of arrays, for a `model_key`."""
+    digest = hashlib.sha256()
+    for array in arrays:
+        digest.update(npy(array))
+    return digest.hexdigest()
+
+
 def npy(array: np.ndarray) -> bytes:
     """Return an array as the content of a .npy file."""
     content = io.BytesIO()

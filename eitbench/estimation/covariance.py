@@ -18,6 +18,8 @@ _BLOCK = 128
 _PANEL = 64
 """Number of columns passed to a callable transition at once; a panel fits the CPU cache."""
 
+COMPRESSED_FROM = 8
+"""Time of the first compression of the transient; before, its rank has hardly decreased."""
 TRANSIENT_TOLERANCE = 1e-14
 """Eigenvalues of the transient U D Uᵀ below this part of Π_∞'s largest entry are dropped."""
 
@@ -161,28 +163,36 @@ class OpenLoopCovariance:
 
     Π_t does not depend on data, so it is computed once and shared by all episodes. It is stored as
     Π_t = Π_∞ + U D Uᵀ with D = diag(±1): the remainder of the initial covariance, U ← F U, loses
-    rank quickly because of advection and diffusion. ``ValueError`` if Π_t has no limit.
+    rank quickly because of advection and diffusion.
 
     Parameters
     ----------
     transition : (n, n)
-        F, with spectral radius below one (or F = I without noise, for a stationary target).
+        F.
     noise : (n, n)
         Γ_w.
-    initial : (n, n), optional
-        Γ_{0|0}; by default Π_∞.
+    limit : (n, n)
+        Π_∞.
+    factor, signs : (n, r), (r,)
+        U and the diagonal of D at t = 0.
+    late_factor, late_signs : (n, s), (s,)
+        The same at t = `COMPRESSED_FROM`.
     """
 
-    def __init__(self, transition: np.ndarray, noise: np.ndarray,
-                 initial: np.ndarray | None = None) -> None:
+    def __init__(self, transition: np.ndarray, *, noise: np.ndarray, limit: np.ndarray,
+                 factor: np.ndarray, signs: np.ndarray, late_factor: np.ndarray,
+                 late_signs: np.ndarray) -> None:
         self.transition = transition
         self.noise = noise
-        self.limit = _stationary(transition, noise)
-        self._threshold = TRANSIENT_TOLERANCE * np.abs(self.limit).max()
-        left = (np.zeros((len(noise), 0)), np.zeros(0))
-        if initial is not None:
-            left = _signed_factor(initial - self.limit, self._threshold)
-        self._transients = [left]  # (U, D) at t = 0, 1, …
+        self.limit = limit
+        self._late = late_factor, late_signs
+        self._transients = [(factor, signs)]  # (U, D) at t = 0, 1, …
+
+    @classmethod
+    def of(cls, transition: np.ndarray, noise: np.ndarray,
+           initial: np.ndarray | None = None) -> Self:
+        """Return the covariance with the arguments of `open_loop_arrays`."""
+        return cls(transition, **open_loop_arrays(transition, noise, initial))
 
     def apply(self, t: int, X: np.ndarray) -> np.ndarray:
         """Return Π_t X for X (n, k)."""
@@ -196,14 +206,40 @@ class OpenLoopCovariance:
 
     def _transient(self, t: int) -> tuple[np.ndarray, np.ndarray]:
         while len(self._transients) <= t:
+            time = len(self._transients)
+            if time == COMPRESSED_FROM:
+                self._transients.append(self._late)
+                continue
             U, signs = self._transients[-1]
             U = self.transition @ U
-            if len(self._transients) % 2 and U.shape[1]:
-                Q, R = np.linalg.qr(U)
-                W, signs = _signed_factor((R * signs) @ R.T, self._threshold)
-                U = Q @ W
+            if time > COMPRESSED_FROM and time % 2 == 0:
+                U, signs = _compressed(U, signs, _threshold(self.limit))
             self._transients.append((U, signs))
         return self._transients[t]
+
+
+def open_loop_arrays(transition: np.ndarray, noise: np.ndarray,
+                     initial: np.ndarray | None = None) -> dict[str, np.ndarray]:
+    """Return the arguments of `OpenLoopCovariance` by name, except the first.
+
+    Parameters
+    ----------
+    transition : (n, n)
+        F, with spectral radius below one (or F = I without noise, for a stationary target).
+        ``ValueError`` if Π_t has no limit.
+    noise : (n, n)
+        Γ_w.
+    initial : (n, n), optional
+        Γ_{0|0}; by default Π_∞.
+    """
+    limit = _stationary(transition, noise)
+    factor, signs = np.zeros((len(noise), 0)), np.zeros(0)
+    if initial is not None:
+        factor, signs = _signed_factor(initial - limit, _threshold(limit))
+    late = np.linalg.matrix_power(transition, COMPRESSED_FROM) @ factor
+    late_factor, late_signs = _compressed(late, signs, _threshold(limit))
+    return {"noise": noise, "limit": limit, "factor": factor, "signs": signs,
+            "late_factor": late_factor, "late_signs": late_signs}
 
 
 class LowRankCovariance(Covariance):
@@ -284,9 +320,8 @@ def _stationary(F: np.ndarray, noise: np.ndarray) -> np.ndarray:
     total = noise
     power = F
     for _ in range(40):
-        added = power @ total @ power.T
+        added = DenseCovariance(total).propagate(power).array
         total = total + added
-        total = 0.5 * (total + total.T)
         if not np.isfinite(total).all():
             break
         if np.abs(added).max() <= 1e-16 * np.abs(total).max():
@@ -294,6 +329,20 @@ def _stationary(F: np.ndarray, noise: np.ndarray) -> np.ndarray:
         power = power @ power
     raise ValueError("transition must have a spectral radius below one; the covariance without "
                      "data has no limit")
+
+
+def _threshold(limit: np.ndarray) -> float:
+    return TRANSIENT_TOLERANCE * np.abs(limit).max()
+
+
+def _compressed(U: np.ndarray, signs: np.ndarray,
+                threshold: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return U and D with fewer columns and the same U D Uᵀ up to ``threshold``."""
+    if not U.shape[1]:
+        return U, signs
+    Q, R = np.linalg.qr(U)
+    W, signs = _signed_factor((R * signs) @ R.T, threshold)
+    return Q @ W, signs
 
 
 def _signed_factor(symmetric: np.ndarray, threshold: float) -> tuple[np.ndarray, np.ndarray]:

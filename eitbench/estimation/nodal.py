@@ -9,12 +9,15 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from eitbench._notice import notify
+from eitbench.data.cache import array_digest, cached, config_dict, model_key
 from eitbench.estimation.covariance import (
     Covariance,
     DenseCovariance,
     LowRankCovariance,
     OpenLoopCovariance,
     Transition,
+    open_loop_arrays,
 )
 from eitbench.estimation.filter import Filter, StateSpace
 from eitbench.estimation.forward import Forward
@@ -31,6 +34,10 @@ if TYPE_CHECKING:
 FILTER_RANK_TOLERANCE = 1e-4
 """Rank tolerance of `LowRankCovariance`: estimates differ from the exact filter by 1e-7 standard
 deviations, in a quarter of the time for n = 3,003 (``docs/pipe3d.md``)."""
+OPEN_LOOP_VERSION = 1
+"""Version of stored open-loop covariances."""
+OPEN_LOOP_SECONDS = 2.5
+"""Time on one core for 1,000 nodes; it grows with the third power of their number."""
 
 
 class Motion(NamedTuple):
@@ -210,7 +217,7 @@ def table_5_1_filter(transport: Transport, prior: Prior, c_ref: float, *,
 
 def _flowing_states(transport: Transport, prior: Prior, c_ref: float,
                     rank_tolerance: float = FILTER_RANK_TOLERANCE) -> NodalStates:
-    F, Y, _ = transport.evolution_model()
+    F, Y = transport.transition()
     covariance = LowRankCovariance(_open_loop(transport, prior), rank_tolerance, c_ref**2)
     return NodalStates(np.full(len(F), c_ref), covariance, Motion(F, Y.sum(axis=1) * c_ref))
 
@@ -234,8 +241,18 @@ def initial_covariance(mesh: Mesh, prior: Prior) -> np.ndarray:
 
 @lru_cache(maxsize=12)
 def _open_loop(transport: Transport, prior: Prior) -> OpenLoopCovariance:
-    return OpenLoopCovariance(transport.evolution_model().F, _state_noise(transport, prior),
-                              initial_covariance(transport.mesh, prior))
+    F, Y = transport.transition()
+
+    def build() -> dict[str, np.ndarray]:
+        if (seconds := OPEN_LOOP_SECONDS * (len(F) / 1000)**3) > 2.0:
+            notify(f"computing the covariance of {len(F)} nodes without measurements, about "
+                   f"{seconds:.0f} s; it is cached in {key.path.parent}")
+        return open_loop_arrays(F, _state_noise(transport, prior),
+                                initial_covariance(transport.mesh, prior))
+
+    known_by = [array_digest(F, Y, transport.mesh.points), config_dict(prior)]
+    key = model_key("open_loop", known_by, OPEN_LOOP_VERSION)
+    return OpenLoopCovariance(F, **cached(key, build))
 
 
 @lru_cache(maxsize=4)

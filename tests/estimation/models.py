@@ -35,7 +35,7 @@ class LinearGaussian(NamedTuple):
 
     def filter(self):
         """Return the package's filter of this model, with covariance Π − Z Zᵀ."""
-        covariance = LowRankCovariance(OpenLoopCovariance(self.F, self.Q, self.covariance))
+        covariance = LowRankCovariance(OpenLoopCovariance.of(self.F, self.Q, self.covariance))
         return Filter(NodalStates(self.mean, covariance, Motion(self.F, self.s)))
 
 

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import scipy.linalg
+from eitbench.data.cache import use_cache_dir
 from eitbench.estimation import (
     DenseCovariance,
     Filter,
@@ -12,10 +13,13 @@ from eitbench.estimation import (
     OpenLoopCovariance,
     kalman_filter,
     linearise_voltages,
+    nodal,
 )
+from eitbench.estimation.nodal import nodal_states
 from eitbench.physics.observation import VoltageNoise
 from eitbench.scoring import normalised_innovations
-from models import QuadraticModel, draw, random_design, random_model
+from eitbench.worlds.world import Prior
+from models import QuadraticModel, coarse_transport, draw, random_design, random_model
 from scipy.stats import chi2
 
 TIMES = [0, 1, 2, 3, 7, 8, 20, 60, 200]
@@ -27,7 +31,7 @@ def model():
 
 
 def open_loop(model):
-    return OpenLoopCovariance(model.F, model.Q, model.covariance)
+    return OpenLoopCovariance.of(model.F, model.Q, model.covariance)
 
 
 def recursion(model):
@@ -57,10 +61,29 @@ def test_unstable_models_have_no_limit(radius):
 
 def test_stationary_target_keeps_its_covariance(model):
     """F = I without noise, the stationary target of thesis 7.2."""
-    at_rest = OpenLoopCovariance(np.eye(14), np.zeros((14, 14)), model.covariance)
+    at_rest = OpenLoopCovariance.of(np.eye(14), np.zeros((14, 14)), model.covariance)
     for t in (0, 1, 9):
         np.testing.assert_allclose(at_rest.apply(t, np.eye(14)), model.covariance,
                                    atol=1e-12 * np.abs(model.covariance).max())
+
+
+def test_open_loop_covariance_is_cached_for_a_flow_and_a_prior(tmp_path, monkeypatch):
+    """A second process reads the same bits; another flow or prior has its own file."""
+    def covariance(velocity=1.0, **prior):
+        _, held = nodal_states(coarse_transport([velocity], 1e-2), Prior(**prior), 1.0).initial()
+        return held.open_loop
+
+    with use_cache_dir(tmp_path):
+        built = covariance()
+        with monkeypatch.context() as patch:
+            patch.setattr(nodal, "open_loop_arrays", lambda *_: pytest.fail("computed again"))
+            read = covariance()
+        assert read is not built
+        for t in TIMES:
+            assert np.array_equal(read.diagonal(t), built.diagonal(t))
+        others = [covariance(velocity=1.1), covariance(inflow_std=0.3), covariance(initial_length=0.02)]
+    assert len(list(tmp_path.rglob("open_loop*"))) == 4
+    assert all(not np.allclose(each.limit + each.diagonal(0), built.limit + built.diagonal(0)) for each in others)
 
 
 def test_arguments_are_not_modified(model):

@@ -187,7 +187,7 @@ def build_joint_model(world: World) -> JointModel:
     learnt = np.zeros_like(mass)
     for part in BASIS_VELOCITIES:
         each = motion(part * flow.nominal[0])
-        open_loop = OpenLoopCovariance(each.transition, each.noise)
+        open_loop = OpenLoopCovariance.of(each.transition, each.noise)
         states = NodalStates(np.ones(len(mass)),
                              LowRankCovariance(open_loop, FILTER_RANK_TOLERANCE), each)
         learnt += covariance_reduction(Filter(states), record, 10)
