@@ -3,13 +3,15 @@ specifies.
 
 An unknown velocity is estimated with the inflow. An identified model replaces the nominal flow;
 with only a prior of the inflow, the nominal velocity is scaled by an unknown factor. Rare slugs
-have two regimes. For stationary targets, the state is the logarithm of the concentration.
+have two regimes. For stationary targets, the state is the logarithm of the concentration. A body
+that moves by itself has a particle filter of its position.
 """
 
 from pathlib import Path
 
 from eitbench import Task
 from eitbench.estimation import (
+    BodyTracker,
     Filter,
     FilterEstimator,
     LogStates,
@@ -29,7 +31,6 @@ from eitbench.estimation import (
 )
 from eitbench.estimation.inflow_prior import nominal_worlds, source_world
 from eitbench.estimation.walk import RandomWalk
-from eitbench.physics.stationary import StationaryTransport
 
 BASELINE_DIR = Path(__file__).parent
 BOUNDS = (0.05, 4.0)
@@ -65,7 +66,9 @@ class Estimator(FilterEstimator):
 def choose(task: Task, c_ref: float, prior, model):
     """Return the filter at t = 0."""
     extended = linearise_at_prediction(task)
-    if isinstance(task.transport, StationaryTransport | RandomWalk):
+    if task.body is not None:
+        return BodyTracker(task)
+    if task.is_stationary or isinstance(task.transport, RandomWalk):
         return Filter(LogStates(nodal_states(task.transport, task.prior, 1.0), c_ref), extended)
     if prior is None and task.velocity is None:
         states = nodal_states(task.transport, task.prior, c_ref)

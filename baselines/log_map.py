@@ -10,7 +10,6 @@ import numpy as np
 
 from eitbench import Task
 from eitbench.estimation import FilterEstimator, StationaryMap
-from eitbench.physics.stationary import StationaryTransport
 
 
 class Estimator(FilterEstimator):
@@ -21,7 +20,7 @@ class Estimator(FilterEstimator):
 
     @staticmethod
     def suits(task: Task) -> bool:
-        return isinstance(task.transport, StationaryTransport)
+        return task.is_stationary
 
 
 def exponential(logarithm: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -15,7 +15,6 @@ from eitbench.estimation import (
     modal_states,
 )
 from eitbench.estimation.walk import RandomWalk, matern32_transition, matern_modes
-from eitbench.physics.stationary import StationaryTransport
 
 
 class Estimator(FilterEstimator):
@@ -32,4 +31,4 @@ class Estimator(FilterEstimator):
 
     @staticmethod
     def suits(task: Task) -> bool:
-        return isinstance(task.transport, StationaryTransport | RandomWalk)
+        return task.is_stationary or isinstance(task.transport, RandomWalk)

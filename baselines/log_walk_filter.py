@@ -15,7 +15,6 @@ from eitbench.estimation import (
     nodal_states,
 )
 from eitbench.estimation.walk import RandomWalk
-from eitbench.physics.stationary import StationaryTransport
 
 
 class Estimator(FilterEstimator):
@@ -28,4 +27,4 @@ class Estimator(FilterEstimator):
 
     @staticmethod
     def suits(task: Task) -> bool:
-        return isinstance(task.transport, StationaryTransport | RandomWalk)
+        return task.is_stationary or isinstance(task.transport, RandomWalk)

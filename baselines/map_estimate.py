@@ -8,7 +8,6 @@ import numpy as np
 
 from eitbench import Task
 from eitbench.estimation import FilterEstimator, StationaryMap
-from eitbench.physics.stationary import StationaryTransport
 
 
 class Estimator(FilterEstimator):
@@ -20,4 +19,4 @@ class Estimator(FilterEstimator):
 
     @staticmethod
     def suits(task: Task) -> bool:
-        return isinstance(task.transport, StationaryTransport)
+        return task.is_stationary

@@ -12,7 +12,6 @@ from dataclasses import replace
 from eitbench import Task
 from eitbench.estimation import FilterEstimator, linearise_at_reference, nodal_filter
 from eitbench.estimation.walk import RandomWalk
-from eitbench.physics.stationary import StationaryTransport
 
 LENGTH = 0.113
 """m"""
@@ -33,4 +32,4 @@ class Estimator(FilterEstimator):
 
     @staticmethod
     def suits(task: Task) -> bool:
-        return not isinstance(task.transport, StationaryTransport | RandomWalk)
+        return not task.is_stationary and not isinstance(task.transport, RandomWalk)

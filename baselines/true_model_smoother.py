@@ -50,6 +50,11 @@ class Estimator:
                            else closest(task.velocity, revealed.velocity))
         self.t = -task.lag
 
+    @staticmethod
+    def suits(task: Task) -> bool:
+        """Return False for a body that moves by itself: no flow determines its path."""
+        return task.body is None
+
     def from_inflows(self, task: Task, revealed, steady: bool, prior) -> np.ndarray:
         responses = ([steady_response(revealed.transport(1))] if steady
                      else time_varying_responses(revealed.transport, task.n_steps))

@@ -13,7 +13,6 @@ import numpy as np
 from eitbench._files import write_atomically
 from eitbench.bench.scores import Outcome
 from eitbench.measured.segmentation import ktc_score, segment
-from eitbench.physics.stationary import StationaryTransport
 
 if TYPE_CHECKING:
     from eitbench.envs.measured import MeasuredEnv
@@ -41,7 +40,7 @@ class MeasuredRun:
         """(T, k) m/s, parameters of the flow if estimated; nominal if the method returns none"""
         squares = np.full(T, np.nan)
         electrodes = _ElectrodeResiduals(env)
-        at_rest = isinstance(env.task.transport, StationaryTransport)
+        at_rest = env.task.is_stationary
         stored: dict[int, tuple[np.ndarray, np.ndarray | None]] = {}
         seconds = 0.0
         mean = before = np.empty(0)

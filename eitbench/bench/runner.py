@@ -27,7 +27,6 @@ from eitbench.envs.injection import InjectionEnv
 from eitbench.estimation import best_homogeneous
 from eitbench.estimation.walk import RandomWalk
 from eitbench.physics.cross_section import outlet_of
-from eitbench.physics.stationary import StationaryTransport
 from eitbench.physics.transport import ConvectionDiffusion
 from eitbench.worlds.random_streams import episode_streams, generator_from_state
 from eitbench.worlds.registry import entry
@@ -115,8 +114,10 @@ def run_on_measurements(env: MeasuredEnv, method: str | Method, seed: int = 0, *
 
 
 def _motion(task: Task) -> str:
-    if isinstance(task.transport, StationaryTransport):
+    if task.is_stationary:
         return "is stationary"
+    if task.body is not None:
+        return "moves by itself"
     if isinstance(task.transport, RandomWalk):
         return "follows a random walk"
     return f"is advected by a flow that is {'known' if task.velocity is None else 'estimated'}"

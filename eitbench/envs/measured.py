@@ -33,7 +33,6 @@ from eitbench.measured.model import (
 )
 from eitbench.measured.task import task_from_measurements
 from eitbench.measured.vessel import INITIAL_CONTACT_IMPEDANCE, VesselConfig, read_vessel
-from eitbench.physics.stationary import StationaryTransport
 from eitbench.worlds.task import Task
 
 NOISE_FRAMES = 1000
@@ -221,7 +220,7 @@ class MeasuredEnv(FixedLengthEnv):
 
     def scoring_steps(self, t: int) -> range:
         """Return the injections, 1 … T, whose withheld measurements score an estimate at t."""
-        if isinstance(self.task.transport, StationaryTransport):
+        if self.task.is_stationary:
             return range(1, self.episode_steps + 1) if t == self.episode_steps else range(0)
         return range(t, t + 1) if t > self.task.warm_up else range(0)
 

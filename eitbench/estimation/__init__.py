@@ -1,5 +1,6 @@
 """Estimators: filters, smoothers and reconstructions, on matrices and voltage models."""
 
+from eitbench.estimation.body_particles import BodyTracker
 from eitbench.estimation.correction import (
     FilterFeatures,
     NetworkCorrectedFilter,
@@ -84,20 +85,21 @@ from eitbench.estimation.velocity import (
 )
 
 __all__ = [
-    "CalibrationFrame", "DenseCovariance", "EnsembleFilter", "Filter", "FilterEstimator",
-    "FilterFeatures", "FrameEstimator", "IdentifiedModel", "ImpulseResponse", "InflowPrior",
-    "InflowWindow", "LinearMeasurement", "LinearisedForwardModel", "LogStates", "LowRankCovariance",
-    "Motion", "NetworkCorrectedFilter", "NodalStates", "OpenLoopCovariance", "ParticleInflowFilter",
-    "QuadraticVoltageModel", "RecordSmoother", "Regimes", "ScaledVoltageModel", "StateSpace",
-    "StationaryMap", "Step", "SwitchingInflowFilter", "UnscentedFilter", "VelocityInflowWindow",
-    "VelocityPrior", "VelocityStates", "VoltageFeatures", "apply_correction", "best_homogeneous",
+    "BodyTracker", "CalibrationFrame", "DenseCovariance", "EnsembleFilter", "Filter",
+    "FilterEstimator", "FilterFeatures", "FrameEstimator", "IdentifiedModel", "ImpulseResponse",
+    "InflowPrior", "InflowWindow", "LinearMeasurement", "LinearisedForwardModel", "LogStates",
+    "LowRankCovariance", "Motion", "NetworkCorrectedFilter", "NodalStates",
+    "OpenLoopCovariance", "ParticleInflowFilter", "QuadraticVoltageModel", "RecordSmoother",
+    "Regimes", "ScaledVoltageModel", "StateSpace", "StationaryMap", "Step",
+    "SwitchingInflowFilter", "UnscentedFilter", "VelocityInflowWindow", "VelocityPrior",
+    "VelocityStates", "VoltageFeatures", "apply_correction", "best_homogeneous",
     "compatible_models", "compatible_priors", "condition", "fit_inflow_prior",
     "fit_prior_from_episodes", "fixed_interval_smoother", "flow_motion", "full_window_filter",
     "gauss_newton", "gru_step", "identify_model", "inflow_filter", "initial_covariance",
     "initial_hidden_state", "innovate", "kalman_filter", "linearise_at_prediction",
     "linearise_at_reference", "linearise_voltages", "load_network", "map_inflow",
-    "maximise_posterior", "modal_states", "network_matches_task", "nodal_filter", "nodal_states",
-    "one_step", "reduced_response", "scaled_velocity_prior", "smooth_means",
+    "maximise_posterior", "modal_states", "network_matches_task", "nodal_filter",
+    "nodal_states", "one_step", "reduced_response", "scaled_velocity_prior", "smooth_means",
     "smooth_state", "smoothness_covariance", "steady_response", "table_5_1_filter",
     "task_velocity_prior", "time_varying_responses", "total_variation", "velocity_states",
 ]

@@ -22,7 +22,6 @@ from eitbench.envs.rendering import draw_electrodes, draw_field
 from eitbench.measured.calibration import electrode_misfits
 from eitbench.measured.quality import percent
 from eitbench.measured.segmentation import ktc_score, require_round_tank, segment
-from eitbench.physics.stationary import StationaryTransport
 from eitbench.report.templates import data_uri, render_template
 
 if TYPE_CHECKING:
@@ -60,13 +59,9 @@ def write_report(path: Path, env: MeasuredEnv, runs: Sequence[MeasuredRun],
         over_time=_over_time(env, runs), velocity=_velocity(env, runs),
         fit=_figure(_fit(env)), correction=CORRECTION_TEXT[calibration.correction],
         contacts=_figure(_contacts(env)), electrodes=_figure(_electrodes(runs[0])),
-        at_rest=_is_at_rest(env), is_scored=env.withheld > 0.0,
+        at_rest=env.task.is_stationary, is_scored=env.withheld > 0.0,
         segmentation="" if truth is None else _figure(_segmentations(env, runs, truth)))
     write_atomically(path, page)
-
-
-def _is_at_rest(env: MeasuredEnv) -> bool:
-    return isinstance(env.task.transport, StationaryTransport)
 
 
 def _facts(env: MeasuredEnv) -> dict[str, str]:
@@ -84,12 +79,12 @@ def _facts(env: MeasuredEnv) -> dict[str, str]:
             _noise(calibration.noise),
         "noise in the task": _noise(task.noise)}
     flow = env.vessel.flow
-    if flow is not None and not _is_at_rest(env):
+    if flow is not None and not env.task.is_stationary:
         spread = f"± {flow.velocity_std:.2g} m/s" if flow.is_estimated else "known"
         return facts | {"flow": f"{flow.mean_velocity:.3g} m/s on average, {spread}"}
     facts["initial state"] = (f"± {percent(task.prior.initial_std)} of the background, smooth "
                               f"over {100 * task.prior.initial_length:.2g} cm")
-    if not _is_at_rest(env):
+    if not env.task.is_stationary:
         facts["random walk"] = (f"± {percent(task.prior.nodal_std)} of the background in a step "
                                 f"of {1e3 * task.transport.time_step:.3g} ms")
     return facts
@@ -101,7 +96,7 @@ def _noise(noise: Any) -> str:
 
 def _estimate(env: MeasuredEnv, run: MeasuredRun) -> str:
     """The last estimate of a target at rest, or an animation, as a data URI."""
-    if _is_at_rest(env):
+    if env.task.is_stationary:
         return _figure(_picture(env, run, len(run.steps) - 1))
     after = np.flatnonzero(run.steps > min(env.task.warm_up, env.episode_steps - 1))
     rows = after[np.unique(np.linspace(0, len(after) - 1, N_PLOTTED_FRAMES).round().astype(int))]

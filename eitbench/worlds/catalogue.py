@@ -445,6 +445,20 @@ particles; reward and ẽ_c are computed from the image, as in the other environ
 concentration of the liquid is known. Voltages that are not measured are zero in the observation.
 """
 
+WANDERING_BODY_2D = replace(TANK_TRACKING, name="WanderingBody2D",
+                            instrument=replace(TANK_TRACKING.instrument, readings="all"))
+
+register_example(WANDERING_BODY_2D, "eitbench/WanderingBody2D-v0", description="""
+A plastic body with a radius of 14 to 18 mm moves by itself in a tank of liquid at rest: it runs
+straight ahead at 0.1 to 0.3 m/s and turns at random times, 0.4 s apart in the mean. Sixteen
+electrodes are measured in every injection, 25 ms apart; in a frame of sixteen injections the body
+moves by several radii. It is the body of `eitbench/TankTracking-v0`, with all voltages and without
+a choice of the injection.
+
+Sizes, speeds and conductivity of the body are in `env.unwrapped.task.body`, its motion in an
+episode is not. A filter of its position has few unknowns; an image has one for each node, and no
+model of what moves.
+""")
 register_injection(TANK_TRACKING, "eitbench/TankTracking-v0", test_seeds="test:0-49",
                    is_starting_point=True, description=f"""
 Follow a body that moves by itself, with a few measurements of each injection. This environment is

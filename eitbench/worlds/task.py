@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from eitbench import _check
+from eitbench.physics.stationary import StationaryTransport
+from eitbench.worlds.bodies import WanderingBody
 from eitbench.worlds.world import Discretisation, Prior, Vessel, World
 
 if TYPE_CHECKING:
@@ -77,6 +79,8 @@ class Task:
         Sizes and electrodes.
     world : str
         Name of the world, by which trained models are found.
+    body : WanderingBody, optional
+        Contrast, sizes and motion of a body that moves by itself; not those of an episode.
     """
 
     transport: Transport
@@ -92,6 +96,7 @@ class Task:
     velocity: VelocityModel | None = None
     vessel: Vessel | None = None
     world: str = ""
+    body: WanderingBody | None = None
 
     @property
     def mesh(self) -> Mesh:
@@ -104,6 +109,11 @@ class Task:
         if self.velocity is None or not isinstance(self.transport, ConvectionDiffusion):
             raise ValueError("the flow has no parameters in this task")
         return self.transport.with_velocity(self.velocity.field(parameters))
+
+    @property
+    def is_stationary(self) -> bool:
+        """True if the target does not move."""
+        return isinstance(self.transport, StationaryTransport) and self.body is None
 
     @property
     def evolution(self) -> EvolutionModel:
@@ -130,7 +140,8 @@ def make_task(world: World, lag: int | str = 0, **assumed: Any) -> Task:
     currents.setflags(write=False)  # shared by the users of this task
     return Task(model.transport, model.observation, world.instrument.model_noise, currents,
                 world.n_steps, world.warm_up, steps, world.expected_concentration,
-                world.calibration, world.prior, world.velocity_model, world.vessel, world.name)
+                world.calibration, world.prior, world.velocity_model, world.vessel, world.name,
+                world.target if isinstance(world.target, WanderingBody) else None)
 
 
 def lag_steps(world: World, lag: int | str) -> int:

@@ -7,12 +7,13 @@ import numpy as np
 import pytest
 from eitbench.data.episodes import cached_truth_model
 from eitbench.envs.injection_core import InjectionCore
+from eitbench.estimation.body_particles import SIGNAL_ERROR, BodyParticleFilter, body_model
 from eitbench.estimation.onboard.body_belief import BodyBelief
-from eitbench.estimation.onboard.body_filters import SIGNAL_ERROR, BodyFilters, body_model
 from eitbench.estimation.onboard.rules import Rules
 from eitbench.worlds import entry
 from eitbench.worlds.bodies import TRANSITION_WIDTH, disc_indicator
 from eitbench.worlds.random_streams import episode_streams
+from eitbench.worlds.task import make_task
 
 from short import world as short_world
 
@@ -35,14 +36,14 @@ def believed(id=ID):
 def test_signals_are_those_of_the_complete_electrode_model(distance, limit):
     """On the finer mesh of the truth, for a body of the mean radius, also off the points of the grid."""
     rules = rules_of()
-    model, truth = body_model(rules.world.fault_free), cached_truth_model(rules.world)
+    model, truth = body_model(make_task(rules.world)), cached_truth_model(rules.world)
     points, target = truth.transport.mesh.points, rules.world.target
     centre = distance * np.array([np.cos(0.3), np.sin(0.3)])
     liquid = np.full(len(points), target.background)
     disc = disc_indicator(points, centre, model.radius, TRANSITION_WIDTH)
     with_body = liquid + (target.concentration - target.background) * disc
     expected = np.subtract(*(truth.observation.transfer_resistance(c) for c in (with_body, liquid)))
-    filters = BodyFilters(rules, np.zeros((1, 16, 16)))
+    filters = BodyParticleFilter(model, 1, 1)
     filters.particles.centres[:] = centre
     filters.particles.areas[:] = 1.0
     index, weights = (each[0, 0] for each in model.cells(filters.particles))
@@ -56,7 +57,7 @@ def test_weights_are_those_of_bayes_formula():
     """One measurement from equal weights: the likelihood of each particle's voltages at the measured electrodes,
     relative to the density of the noise, and the moments of the innovation."""
     core, _ = believed()
-    filters, rules = core._filters, core.rules
+    filters, rules = core._filters.filter, core.rules
     filters.weights[:] = 1.0 / filters.n_particles
     pair = 57
     (i, j), amplitude = rules.pairs[pair], rules.amplitude
@@ -65,7 +66,7 @@ def test_weights_are_those_of_bayes_formula():
     model = filters.model
     base = amplitude * (model.resistance[i] - model.resistance[j])
     measured = [k for k in ((i - 1) % 16, (i + 1) % 16, (j - 1) % 16, (j + 1) % 16) if k not in (i, j)]
-    std = model.table.noise_std(base, 0.0)[measured]
+    std = model.noise_std(base)[measured]
     expected = np.empty(filters.n_particles)
     residuals, variances = [], []
     index, weights = (each[0] for each in model.cells(filters.particles))
@@ -78,7 +79,7 @@ def test_weights_are_those_of_bayes_formula():
         variances.append(variance)
         expected[p] = -0.5 * (residual**2 / variance + np.log(variance / std**2)).sum()
     np.testing.assert_allclose(resampled[0], expected, rtol=1e-9)
-    (innovation,) = filters.innovations()
+    (innovation,) = core.innovations()
     order = [sorted(measured).index(k) for k in measured]
     np.testing.assert_allclose(innovation.value[order], np.mean(residuals, axis=0), rtol=1e-9, atol=1e-12)
     S = np.cov(np.transpose(residuals), bias=True) + np.diag(np.mean(variances, axis=0))
@@ -89,13 +90,13 @@ def test_weights_are_those_of_bayes_formula():
 def test_criteria_are_those_of_a_gaussian_of_images_and_voltages():
     """A-criterion: the decrease of the image's variances by conditioning; D-criterion: half log det of S R⁻¹."""
     _, belief = believed()
-    filters, rules = belief._filters, belief.rules
+    filters, rules = belief._filters.filter, belief.rules
     model = filters.model
     gains, information = belief.criteria()
     particles = model.move(filters.particles, np.random.default_rng(1))
     index, share = (each[0] for each in model.cells(particles))
     w = filters.weights[0]
-    images = np.array([model.patches[:, index[p]] @ share[p] for p in range(len(w))])
+    images = np.array([belief._filters.patches[:, index[p]] @ share[p] for p in range(len(w))])
     changes = np.array([model.signals[:, index[p]] @ share[p] for p in range(len(w))]).reshape(-1, 16, 16)
     for pair in (0, 7, 57, 119):
         i, j = rules.pairs[pair]
@@ -103,7 +104,7 @@ def test_criteria_are_those_of_a_gaussian_of_images_and_voltages():
         current[[i, j]] = rules.amplitude, -rules.amplitude
         measured = rules.instrument.measurement_mask(current)
         voltages = (changes @ current)[:, measured]
-        std = model.table.noise_std(model.resistance @ current, 0.0)[measured]
+        std = model.noise_std(model.resistance @ current)[measured]
         R = np.diag(std**2 + SIGNAL_ERROR**2 * (w @ voltages**2))
         joint = np.cov(np.hstack([images, voltages]).T, aweights=w, bias=True)
         m = images.shape[1]
@@ -114,7 +115,7 @@ def test_criteria_are_those_of_a_gaussian_of_images_and_voltages():
 
 def test_body_has_the_moments_of_the_particles_that_are_present():
     core, _ = believed("eitbench/SearchAndTrack-v0")
-    filters, random = core._filters, np.random.default_rng(0)
+    filters, random = core._filters.filter, np.random.default_rng(0)
     filters.weights[:] = random.dirichlet(np.ones(filters.n_particles))
     filters.particles.present[:] = random.uniform(size=filters.n_particles) < 0.3
     present = filters.particles.present[0]
@@ -134,9 +135,9 @@ def test_belief_is_the_filter_inside(id):
     for pair in (7, 100, 3):
         core.act(np.array([pair]))
         belief.update({name: array[0] for name, array in core.observe().items()})
-        for ours, inside in zip(belief._filters.particles, core._filters.particles, strict=True):
+        for ours, inside in zip(belief._filters.filter.particles, core._filters.filter.particles, strict=True):
             np.testing.assert_array_equal(ours, inside)
-        np.testing.assert_array_equal(belief._filters.weights, core._filters.weights)
+        np.testing.assert_array_equal(belief._filters.filter.weights, core._filters.filter.weights)
 
 
 def test_estimate_finds_the_body():

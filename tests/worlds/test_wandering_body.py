@@ -3,12 +3,13 @@
 import numpy as np
 import pytest
 from eitbench.data.episodes import simulate
-from eitbench.estimation.onboard.body_filters import body_model
+from eitbench.estimation.body_particles import body_model
 from eitbench.estimation.onboard.rules import Rules
 from eitbench.worlds import entry
 from eitbench.worlds.bodies import WanderingBody, disc_indicator, reflect
 from eitbench.worlds.instrument import Instrument
 from eitbench.worlds.random_streams import episode_streams
+from eitbench.worlds.task import make_task
 
 TRACKING, SEARCH = (entry(f"eitbench/{name}-v0").world for name in ("TankTracking", "SearchAndTrack"))
 
@@ -81,7 +82,7 @@ def test_mesh_of_the_truth_resolves_the_body(centre, median, worst):
         return currents @ np.subtract(*truth.observation.transfer_resistance(30.0 - np.outer([28.5, 0.0], disc)))
 
     currents = Rules(TRACKING).action_currents
-    std = TRACKING.noise.std(currents @ body_model(TRACKING).resistance)
+    std = TRACKING.noise.std(currents @ body_model(make_task(TRACKING)).resistance)
     std[~TRACKING.instrument.measurement_mask(currents)] = np.nan
     exact = voltages(4)
     coarse, errors = (np.sqrt(np.nanmean(((voltages(each) - exact) / std)**2, axis=1)) for each in (1, 2))

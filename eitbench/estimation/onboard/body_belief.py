@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import scipy.sparse as sp
 
-from eitbench.estimation.onboard.body_filters import SIGNAL_ERROR, BodyFilters, measured_first
+from eitbench.estimation.body_particles import SIGNAL_ERROR, measured_first
+from eitbench.estimation.onboard.body_filters import BodyFilters
 from eitbench.worlds.bodies import reflect
 
 if TYPE_CHECKING:
@@ -36,18 +37,19 @@ class BodyBelief(PolicyBelief):
     def __init__(self, rules: Rules, observation: dict[str, np.ndarray]) -> None:
         self.rules = rules
         self._filters = BodyFilters(rules, observation["frame"][None])
-        model = self._filters.model
+        model = self._filters.filter.model
+        self._patches = self._filters.patches.shape[0]
         L = len(model.resistance)
         entries = np.triu_indices(L)                            # 𝓡 is symmetric
         number = np.empty((L, L), dtype=int)
         number[entries] = number.T[entries] = np.arange(len(entries[0]))
         signals = rules.amplitude * model.signals.reshape(L, L, -1)[entries]
-        self._functionals = np.vstack([signals, model.patches.toarray()]).T.copy()
+        self._functionals = np.vstack([signals, self._filters.patches.toarray()]).T.copy()
         """(G, entries of 𝓡 and patches) of a body at each grid point"""
         pair_currents = rules.action_currents[:len(rules.pairs)]
         mask = rules.instrument.measurement_mask(pair_currents)
         electrodes, self._measured = measured_first(mask)
-        std = model.table.noise_std(pair_currents @ model.resistance, rules.instrument.noise_floor)
+        std = model.noise_std(pair_currents @ model.resistance)
         self._variance = np.take_along_axis(std**2, electrodes, axis=1)
         source, sink = rules.pairs.T[:, :, None]
         self._from, self._to = number[electrodes, source], number[electrodes, sink]
@@ -64,10 +66,10 @@ class BodyBelief(PolicyBelief):
         the voltages' covariance. For oracles, ``centre`` (2,) in m is the true position of a
         present body, to which the mean of the predicted particles is moved.
         """
-        model = self._filters.model
-        weights = self._filters.weights[0]
+        model = self._filters.filter.model
+        weights = self._filters.filter.weights[0]
         # the random numbers of the filter's next step are not known
-        particles = model.move(self._filters.particles, np.random.default_rng(1))
+        particles = model.move(self._filters.filter.particles, np.random.default_rng(1))
         if centre is not None:
             moved = particles.centres + centre - weights @ particles.centres[0]
             particles = particles._replace(centres=reflect(moved, moved, model.limit)[0],
@@ -85,7 +87,7 @@ class BodyBelief(PolicyBelief):
         second = np.diagonal(S, axis1=1, axis2=2) + (mean[i] - mean[j])**2
         root = self._measured / np.sqrt(self._variance + SIGNAL_ERROR**2 * second)
         S = S * root[:, :, None] * root[:, None] + np.eye(root.shape[1])
-        patches = slice(-model.patches.shape[0], None)
+        patches = slice(-self._patches, None)
         cross = (covariance[i, patches] - covariance[j, patches]) * root[..., None]
         gains = (np.linalg.inv(S) * (cross @ np.swapaxes(cross, 1, 2))).sum(axis=(1, 2))
         return gains, 0.5 * np.linalg.slogdet(S)[1]

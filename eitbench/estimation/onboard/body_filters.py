@@ -1,286 +1,64 @@
-"""Particle filters of the position of a body in a round tank, for batches of episodes."""
+"""Particle filters of a body inside injection environments."""
 
 from __future__ import annotations
 
-import math
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy.sparse as sp
 
+from eitbench.estimation.body_particles import PARTICLES, BodyParticleFilter, body_model
 from eitbench.estimation.onboard.episode_filters import EpisodeFilters, Innovation
-from eitbench.estimation.onboard.linearisation import linearisation_table, std_from_variance
-from eitbench.numerics.compiled import compiled_kernels
-from eitbench.numerics.fem import mass_matrix
-from eitbench.worlds.bodies import (
-    DISC_POINTS,
-    DISC_WEIGHTS,
-    TRANSITION_WIDTH,
-    WanderingBody,
-    disc_indicator,
-    reflect,
-)
+from eitbench.estimation.onboard.linearisation import linearisation_table
 
 if TYPE_CHECKING:
     from eitbench.worlds.world import World
 
-SPACING = 5e-3
-"""m, spacing of the grid on which signals and images of a body are tabulated."""
-SIGNAL_ERROR = 0.05
-"""Standard deviation of the error of a body's signal, relative to the signal."""
-POSITION_JITTER = 1e-3
-"""m, standard deviation of the movement of a resampled particle."""
-AREA_WALK = 0.02
-"""Standard deviation per step of the logarithm of a particle's area."""
-PARTICLES = 512
-FULL_PARTICLES = 2048
-
-
-class Particles(NamedTuple):
-    """Particles of B episodes."""
-
-    centres: np.ndarray
-    """(B, P, 2) m"""
-    velocities: np.ndarray
-    """(B, P, 2) m/s"""
-    areas: np.ndarray
-    """(B, P) area of the body relative to the mean one"""
-    present: np.ndarray
-    """(B, P) bool: whether the body is in the tank"""
-
-
-class BodyModel:
-    """Motion, signals and images of a body, shared by all episodes of a world.
-
-    The signal of a disc is the linearised one times the ratio 2/(1 + k) of an exact and a
-    linearised dipole, with k the ratio of the conductivities, and proportional to its area. With
-    the best area it is within 6 % of the complete electrode model up to three radii from the wall,
-    and within 12 % at half of that. The motion is an Ornstein–Uhlenbeck velocity with the speed and
-    the run time of the target.
-    """
-
-    def __init__(self, world: World) -> None:
-        target: WanderingBody = world.target
-        self.world, self.target = world, target
-        self.table = linearisation_table(world)
-        points = self.table.task.mesh.points
-        self.radius = float(np.mean(target.radius_range))
-        self.limit = world.vessel.radius - self.radius
-        self.side = 2 * math.ceil(self.limit / SPACING) + 1
-        """grid points along x and y"""
-        axis = SPACING * (np.arange(self.side) - self.side // 2)
-        grid = np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2)
-        grid, _ = reflect(grid, grid, self.limit)
-        discs = np.array([disc_indicator(points, centre, self.radius, TRANSITION_WIDTH)
-                          for centre in grid])
-        # a coarse mesh distorts the area of a small disc
-        area = mass_matrix(self.table.task.mesh).sum(axis=0)
-        discs *= (math.pi * self.radius**2 / (discs @ area))[:, None]
-        contrast = target.concentration / target.background - 1.0
-        reference = self.table.linearisation(0)
-        self.resistance = reference.resistance
-        self.signals = np.ascontiguousarray(
-            2.0 * contrast / (2.0 + contrast) * self._linearised(grid))
-        """(L², G) change of 𝓡 by a disc at each grid point"""
-        discs[discs < 1e-3] = 0.0
-        self.images = sp.csc_array((contrast * target.background * discs).T)
-        """(n, G) change of the concentration by a disc at each grid point in mol/m³"""
-        self.patches = sp.csc_array(self.table.grid_averages @ self.images)
-        """(patches, G) the same on the coarse grid"""
-        low, high = target.speed_range
-        self.speed = math.sqrt((low**2 + low * high + high**2) / 6.0)
-        """m/s, standard deviation of each component of the velocity"""
-        self.decay = math.exp(-world.time_step / target.run_time)
-        self.log_area_std = (math.log(target.radius_range[1] / target.radius_range[0])
-                             / math.sqrt(3.0))
-        self.leave, self.enter = (-math.expm1(-world.time_step / time)
-                                  for time in (target.visit_time, target.absence_time))
-
-    def __deepcopy__(self, memo: dict[int, Any]) -> BodyModel:
-        return self
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        """Pickle the world only."""
-        return body_model, (self.world,)
-
-    def _linearised(self, grid: np.ndarray) -> np.ndarray:
-        """Return the derivatives (L², G) of 𝓡 by the logarithm of the conductivity in discs about
-        the grid points, from its density in space: a coarse mesh distorts a small disc."""
-        observation = self.table.task.observation
-        cem = observation.cem
-        conductivity = observation.conductivity(np.full(cem.mesh.n_nodes, self.target.background))
-        derivatives = cem.transfer_resistance_derivatives(conductivity)[1]
-        by_node = derivatives.reshape(len(conductivity), -1)
-        density = conductivity[0] * by_node / mass_matrix(cem.mesh).sum(axis=0)[:, None]
-        area = math.pi * self.radius**2
-        return area * sum(weight * (cem.mesh.interpolation_to(grid + self.radius * point) @ density)
-                          for weight, point in zip(DISC_WEIGHTS, DISC_POINTS, strict=True)).T
-
-    def draw(self, random: np.random.Generator, count: int) -> tuple[np.ndarray, ...]:
-        """Draw centres, velocities and areas of new particles, (count, …)."""
-        angle = random.uniform(0.0, 2.0 * np.pi, count)
-        distance = self.limit * np.sqrt(random.uniform(size=count))
-        return (np.stack([distance * np.cos(angle), distance * np.sin(angle)], axis=1),
-                self.speed * random.standard_normal((count, 2)),
-                np.exp(self.log_area_std * random.standard_normal(count)))
-
-    def move(self, particles: Particles, random: np.random.Generator) -> Particles:
-        """Move particles by a time step, with the same random numbers in all episodes."""
-        centres, velocities, areas, present = particles
-        B, P = areas.shape
-        noise = random.standard_normal((P, 3))
-        velocities = (self.decay * velocities
-                      + math.sqrt(1.0 - self.decay**2) * self.speed * noise[:, :2])
-        areas = areas * np.exp(AREA_WALK * noise[:, 2])
-        centres, velocities = reflect(centres + self.world.time_step * velocities, velocities,
-                                      self.limit)
-        if self.leave > 0.0:
-            draw = random.uniform(size=P)
-            entering = ~present & (draw < self.enter)
-            new = self.draw(random, P)
-            centres, velocities, areas = (
-                np.where(entering.reshape(B, P, *(1,) * (old.ndim - 2)), each, old)
-                for old, each in zip((centres, velocities, areas), new, strict=True))
-            present = np.where(present, draw >= self.leave, entering)
-        return Particles(centres, velocities, areas, present)
-
-    def cells(self, particles: Particles) -> tuple[np.ndarray, np.ndarray]:
-        """Return the grid points (B, P, 4) around each particle, and their bilinear weights, times
-        the area; zero for absent ones."""
-        shape = (*particles.areas.shape, 4)
-        index, weights = np.empty(shape, dtype=int), np.empty(shape)
-        compiled_kernels().bilinear_weights(particles.centres.reshape(-1, 2), SPACING, self.side,
-                                            index.reshape(-1, 4), weights.reshape(-1, 4))
-        weights *= (particles.areas * particles.present)[..., None]
-        return index, weights
-
 
 class BodyFilters(EpisodeFilters):
-    """Particle filters of B episodes: bootstrap proposals, systematic resampling.
+    """Particle filters of B episodes; the concentration of the liquid is known."""
 
-    The concentration of the liquid is known. Random numbers are the same in all episodes.
-    """
-
-    n_particles = PARTICLES
+    n_particles = 512
 
     def _reference_indices(self, frames: np.ndarray) -> list[int]:
         return [0] * len(frames)
 
     def _start(self, episodes: int) -> None:
-        self.model = body_model(self._rules.world.fault_free)
-        self._random = np.random.default_rng(0)
-        P = self.n_particles
-        centres, velocities, areas = (np.repeat(each[None], episodes, axis=0)
-                                      for each in self.model.draw(self._random, P))
-        self.particles = Particles(centres, velocities, areas, np.ones((episodes, P), dtype=bool))
-        self.weights = np.full((episodes, P), 1.0 / P)
-        self._density: np.ndarray | None = None
+        self.filter = BodyParticleFilter(body_model(self.table.task), episodes, self.n_particles)
+        self.patches = body_patches(self._rules.world.fault_free)
 
     def assimilate(self, voltages: np.ndarray,
                    currents: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        model = self.model
-        self.particles = model.move(self.particles, self._random)
-        mask = self._rules.instrument.measurement_mask(currents)
-        electrodes, used = measured_first(mask & currents.any(axis=1, keepdims=True))
-        base = (currents[:, None] @ model.resistance)[:, 0]     # one product per episode
-        std = self.table.noise_std(base, self._rules.instrument.noise_floor)
-        std, residual = (np.take_along_axis(each, electrodes, axis=1)
-                         for each in (std, voltages - base))
-        log_likelihood = np.zeros(self.weights.shape)
-        innovation = np.zeros(residual.shape)
-        S = ~used[:, None] * np.eye(used.shape[1])
-        compiled_kernels().particle_likelihoods(
-            model.signals, *model.cells(self.particles), self.weights, currents, electrodes, used,
-            residual, std**2, SIGNAL_ERROR, log_likelihood, innovation, S)
-        self._last = innovation, S, used
-        self._reweight(log_likelihood)
-        scaled = np.zeros(voltages.shape)
-        np.put_along_axis(scaled, electrodes, innovation / np.sqrt(
-            S.diagonal(axis1=1, axis2=2)), axis=1)
-        return scaled, np.ones(mask.shape, dtype=bool)
-
-    def _reweight(self, log_likelihood: np.ndarray) -> None:
-        log_weights = np.log(np.maximum(self.weights, 1e-300)) + log_likelihood
-        weights = np.exp(log_weights - log_weights.max(axis=1, keepdims=True))
-        self.weights = weights / weights.sum(axis=1, keepdims=True)
-        self._density = None
-        P = self.n_particles
-        offset = self._random.uniform()
-        jitter = POSITION_JITTER * self._random.standard_normal((P, 2))
-        places = (np.arange(P) + offset) / P
-        for b in np.flatnonzero((self.weights**2).sum(axis=1) * P > 2.0):
-            chosen = np.minimum(np.searchsorted(self.weights[b].cumsum(), places), P - 1)
-            for each in self.particles:
-                each[b] = each[b].take(chosen, axis=0)
-            self.particles.centres[b] += jitter
-            self.weights[b] = 1.0 / P
-
-    def _densities(self) -> np.ndarray:
-        """Return the posterior means (2, B, G) on the grid of a body's area, and of its square."""
-        index, shares = self.model.cells(self.particles)
-        densities = np.zeros((2, len(self.weights), self.model.signals.shape[1]))
-        flat = index.reshape(len(self.weights), -1)
-        for density, factor in zip(densities, (1.0, self.particles.areas), strict=True):
-            values = shares * (self.weights * factor)[..., None]
-            compiled_kernels().scatter(flat, values.reshape(flat.shape), density)
-        return densities
+        measured = self._rules.instrument.measurement_mask(currents)
+        innovations = self.filter.assimilate(voltages, currents, measured)
+        return innovations, np.ones(measured.shape, dtype=bool)
 
     def innovations(self) -> list[Innovation | None]:
-        return [Innovation.of(*each) for each in zip(*self._last, strict=True)]
-
-    def _expectations(self, images: sp.csc_array, moment: int) -> np.ndarray:
-        """Return the expectation (B, m) of functionals of the body to the power of ``moment``."""
-        if self._density is None:
-            self._density = self._densities()
-        found = np.zeros((len(self.weights), images.shape[0]))
-        compiled_kernels().add_columns(images.indptr, images.indices, images.data**moment,
-                                       self._density[moment - 1], found)
-        return found
-
-    def _std(self, images: sp.csc_array, mean: np.ndarray) -> np.ndarray:
-        return std_from_variance(self._expectations(images, 2) - mean**2)
+        return [Innovation.of(*each) for each in zip(*self.filter.innovation, strict=True)]
 
     def coarse_grid(self) -> tuple[np.ndarray, np.ndarray]:
-        mean = self._expectations(self.model.patches, 1)
-        return self.c_ref[:, None] + mean, self._std(self.model.patches, mean)
+        return self.c_ref[:, None] + self.filter.mean(self.patches), self.filter.std(self.patches)
 
     def means(self) -> np.ndarray:
-        return self.c_ref[:, None] + self._expectations(self.model.images, 1)
+        return self.c_ref[:, None] + self.filter.mean(self.filter.model.images)
 
     def stds(self) -> np.ndarray:
-        return self._std(self.model.images, self._expectations(self.model.images, 1))
+        return self.filter.std(self.filter.model.images)
 
     def body(self) -> np.ndarray:
-        centres, velocities, areas, present = self.particles
-        weights = self.weights * present
-        presence = weights.sum(axis=1, keepdims=True)
-        weights = weights[:, None] / np.maximum(presence, 1e-300)[:, None]          # (B, 1, P)
-        position, velocity, area = ((weights @ each)[:, 0]
-                                    for each in (centres, velocities, areas[..., None]))
-        deviation = np.swapaxes(centres - position[:, None], 1, 2)
-        covariance = (weights * deviation) @ np.swapaxes(deviation, 1, 2)
-        std = np.sqrt(covariance.diagonal(axis1=1, axis2=2))
-        correlation = covariance[:, 0, 1] / np.maximum(std.prod(axis=1), 1e-300)
-        return np.concatenate([position, velocity, std, correlation[:, None], area, presence],
-                              axis=1)
-
-
-def measured_first(measured: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return electrodes (B, m) that contain the measured ones of a mask (B, L), with m as small as
-    possible, and their mask (B, m)."""
-    m = max(1, measured.sum(axis=1).max())
-    electrodes = np.argsort(~measured, axis=1, kind="stable")[:, :m]
-    return electrodes, np.take_along_axis(measured, electrodes, axis=1)
+        return self.filter.body()
 
 
 class FullBodyFilters(BodyFilters):
     """Particle filters with more particles, for scored runs."""
 
-    n_particles = FULL_PARTICLES
+    n_particles = PARTICLES
 
 
 @lru_cache(maxsize=4)
-def body_model(world: World) -> BodyModel:
-    """Return the model of a world's body, built once per process."""
-    return BodyModel(world)
+def body_patches(world: World) -> sp.csc_array:
+    """Return the change (patches, G) of the concentration on the coarse grid in mol/m³, by a body
+    at each grid point."""
+    table = linearisation_table(world)
+    return sp.csc_array(table.grid_averages @ body_model(table.task).images)
