@@ -45,6 +45,7 @@ SHORT = {
     "StationaryTank2D": {"vessel": {"n_electrodes": 8}, "schedule": {"scored_steps": 5}},
     "PipeInjection": {"schedule": {"scored_steps": 4}},
     "TankTracking": {"schedule": {"scored_steps": 4}},
+    "WanderingBody2D": TANK,
     "SearchAndTrack": {"schedule": {"scored_steps": 4}},
     "TankInjection": {"schedule": {"warm_up": 2, "scored_steps": 3}},
 }
