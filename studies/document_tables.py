@@ -22,7 +22,7 @@ COLUMNS = {
     "Pipe2DBiasedVelocity": "biased", "Pipe2DObstacle": "obstacle",
     "Pipe2DUnknownVelocity": "unknown velocity", "Pipe2DIntermittent": "intermittent",
     "Pipe3D": "3D", "Pipe3DSmoothing": "3D smoothing", "RotatingTank2D": "rotating",
-    "StationaryTank2D": "stationary"}
+    "StationaryTank2D": "stationary", "WanderingBody2D": "body"}
 """Environment -> column of the table of estimators."""
 WITHOUT_FLOW = {"back_projection": "BP", "noser": "NOSER", "total_variation": "TV",
                 "gauss_newton": "GN", "random_walk_filter": "walk",
@@ -61,6 +61,7 @@ ASSUMPTIONS = {
     "joint_extended_kalman_filter": ("estimated parameters", "white inflow"),
     "joint_inflow_filter": ("estimated parameters", "fitted inflow, positive"),
     "ensemble_kalman_filter": ("estimated parameters", "fitted inflow, positive"),
+    "body_particle_filter": ("none", "one disc"),
     "automatic_filter": ("chosen by the task", "chosen by the task"),
     "learned_voltages": ("none", "network"),
     "learned_correction": ("as in the task", "fitted inflow, network"),

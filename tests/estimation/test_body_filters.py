@@ -5,9 +5,10 @@ from functools import lru_cache
 
 import numpy as np
 import pytest
-from eitbench.data.episodes import cached_truth_model
+from eitbench.bench.methods import builtin_methods, load_method
+from eitbench.data.episodes import cached_truth_model, simulate
 from eitbench.envs.injection_core import InjectionCore
-from eitbench.estimation.body_particles import SIGNAL_ERROR, BodyParticleFilter, body_model
+from eitbench.estimation.body_particles import SIGNAL_ERROR, BodyParticleFilter, BodyTracker, body_model
 from eitbench.estimation.onboard.body_belief import BodyBelief
 from eitbench.estimation.onboard.rules import Rules
 from eitbench.worlds import entry
@@ -138,6 +139,36 @@ def test_belief_is_the_filter_inside(id):
         for ours, inside in zip(belief._filters.filter.particles, core._filters.filter.particles, strict=True):
             np.testing.assert_array_equal(ours, inside)
         np.testing.assert_array_equal(belief._filters.filter.weights, core._filters.filter.weights)
+
+
+def test_tracker_is_the_filter_of_an_episode():
+    """It finds from NaN which voltages are measured, and its moments are those of the images, which are interpolated
+    on the grid as their squares are."""
+    world = rules_of().world
+    task, episode = make_task(world), simulate(world, 3, progress=False)
+    tracker, filters = BodyTracker(task), BodyParticleFilter(body_model(task), 1)
+    for k, currents in enumerate(task.currents):
+        voltages = episode.voltages(k + 1, currents, world)
+        assert np.isnan(voltages).sum() == 12
+        tracker.assimilate(voltages, currents)
+        filters.assimilate(voltages[None], currents[None], world.instrument.measurement_mask(currents)[None])
+    estimate, (index, share) = tracker.estimate(), filters.model.cells(filters.particles)
+    images, areas = filters.model.images.toarray(), filters.particles.areas[0]
+    mean = np.einsum("p,pi,npi->n", filters.weights[0], share[0], images[:, index[0]])
+    square = np.einsum("p,pi,p,npi->n", filters.weights[0], share[0], areas, images[:, index[0]]**2)
+    np.testing.assert_allclose(estimate.mean, 30.0 + mean, rtol=1e-9)
+    np.testing.assert_allclose(estimate.variance, square - mean**2, rtol=1e-6, atol=1e-9)
+    assert estimate.innovation.shape == (4,) and estimate.innovation_covariance.shape == (4, 4)
+    with pytest.raises(ValueError, match=r"^lag must be 0"):
+        tracker.estimate(lag=1)
+
+
+def test_methods_for_stationary_targets_do_not_suit_a_body():
+    task = make_task(entry("eitbench/WanderingBody2D-v0").world)
+    suitable = {name for name in builtin_methods("estimation") if load_method(name, "estimation").suits(task)}
+    assert {"body_particle_filter", "automatic_filter", "random_walk_filter", "noser"} <= suitable
+    assert not suitable & {"log_map", "map_estimate", "log_walk_filter", "log_steady_filter", "true_model_smoother"}
+    assert not task.is_stationary and make_task(entry("eitbench/StationaryTank2D-v0").world).is_stationary
 
 
 def test_estimate_finds_the_body():
