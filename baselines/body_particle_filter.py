@@ -1,5 +1,5 @@
-"""Particle filter of the position, velocity and size of a body that moves by itself: four numbers
-and an area instead of an image, with a motion that differs from the true one.
+"""Particle filter of a body that moves by itself: position, velocity and area of a disc instead of
+an image, with a motion that differs from the true one.
 """
 
 from eitbench import Task

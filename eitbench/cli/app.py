@@ -9,7 +9,7 @@ import typer
 
 from eitbench import __version__
 from eitbench.cli import learn, options
-from eitbench.cli.estimate import estimate
+from eitbench.cli.estimate import estimate, fetch
 from eitbench.cli.run import command_line, print_report, run
 from eitbench.cli.verify import verify
 
@@ -147,7 +147,7 @@ def golden(
 
 
 app.add_typer(learn.fit, name="fit")
-for _command in (learn.bank, learn.train, learn.export, estimate):
+for _command in (learn.bank, learn.train, learn.export, estimate, fetch):
     app.command()(_command)
 
 

@@ -1,4 +1,4 @@
-"""Command `estimate`: estimates from measurements of a real instrument."""
+"""Commands `estimate` and `fetch`: measurements of real instruments."""
 
 from __future__ import annotations
 
@@ -89,6 +89,21 @@ def estimate(
         if arrays is not None:
             runs[0].save(arrays, env)
             options.echo(f"wrote {arrays}")
+
+
+def fetch(
+    cases: Annotated[list[str], typer.Argument(
+        help="Names of measured cases, such as iirc of eitbench/Measured-iirc-v0, or YAML files.")],
+) -> None:
+    """Download the public measurements of cases, and check their sha256."""
+    from eitbench.measured.cases import measured_folder, read_case
+    from eitbench.measured.download import download_case
+    with options.cli_errors():
+        for case in [read_case(name) for name in cases]:
+            options.echo(f"{case.name}: {case.title} (licence: {case.licence})")
+            for path in download_case(case):
+                options.echo(f"  wrote {path}")
+            options.echo(f"  complete in {measured_folder()}")
 
 
 def _reader_options(texts: list[str]) -> dict[str, float | str]:

@@ -1,7 +1,7 @@
 """Measured cases: public measurements with vessel, settings and truth, each an environment id.
 
 A case is a YAML file in the folder ``cases``. It identifies its data by sha256 and does not contain
-them: users download them into `measured_folder`.
+them: `eitbench fetch` downloads them into `measured_folder`.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ WITHHELD_FRACTION = 0.1
 """Fraction of the measurements that scores methods."""
 FOLDER_VARIABLE = "EITBENCH_MEASURED"
 _TEXTS = ("title", "file", "sha256", "licence", "source")
-_OPTIONAL = ("auxiliary_files", "truth")
+_OPTIONAL = ("auxiliary_files", "truth", "address")
 _SETTINGS = ("format", "span", "correction", "homogeneous_frames", "moves", "model_error")
 """Arguments of `read` and `MeasuredEnv`, and ``span``: start and stop of the injections used."""
 
@@ -55,6 +55,9 @@ class MeasuredCase:
     """name -> sha256 of files that the reader loads from the same folder"""
     truth: Mapping[str, str] | None = None
     """``file`` and ``sha256`` of a segmentation for `read_truth`"""
+    address: str = ""
+    """of a folder with the files, ending in "/", or of a zip archive whose first folder has them;
+    empty: they cannot be downloaded automatically"""
     settings: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -68,6 +71,8 @@ class MeasuredCase:
                 raise ValueError(f"case.{name} must be entries like 'name: value', got {entries!r}")
         if self.truth is not None and set(self.truth) != {"file", "sha256"}:
             raise ValueError(f"case.truth must have file and sha256, got {self.truth!r}")
+        if not re.fullmatch(r"(https?://\S+)?", str(self.address)):
+            raise ValueError(f"case.address must begin with https://, got {self.address!r}")
         digests = {"sha256": self.sha256, **self.auxiliary_files,
                    **({"truth.sha256": self.truth["sha256"]} if self.truth else {})}
         for name, digest in digests.items():
@@ -90,6 +95,14 @@ class MeasuredCase:
                    "truth": self.truth and self.truth["sha256"], "vessel": dict(self.vessel),
                    "withheld": WITHHELD_FRACTION, "settings": dict(self.settings)}
         return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
+
+    @property
+    def files(self) -> dict[str, str]:
+        """Paths of all files below `measured_folder`, and their sha256."""
+        truth = {} if self.truth is None else {self.truth["file"]: self.truth["sha256"]}
+        beside = {str(Path(self.file).with_name(name)): digest
+                  for name, digest in self.auxiliary_files.items()}
+        return {self.file: self.sha256} | beside | truth
 
     @property
     def options(self) -> dict[str, Any]:
@@ -118,13 +131,12 @@ class MeasuredCase:
 
     def _check(self, path: Path, digest: str) -> None:
         if not path.exists():
+            fetch = f"Run `eitbench fetch {self.name}`, s" if self.address else "S"
             raise ValueError(
                 f"{case_id(self.name)} requires the file {path.name} with sha256 "
-                f"{digest}, from {self.source} (licence: {self.licence}). Save it as {path}, or "
-                f"set ${FOLDER_VARIABLE} to the folder that has {self.file}")
-        if (actual := file_sha256(path)) != digest:
-            raise ValueError(f"{path} must have the sha256 {digest} of the case {self.name}, got "
-                             f"{actual}")
+                f"{digest}, from {self.source} (licence: {self.licence}). {fetch}ave it as {path}, "
+                f"or set ${FOLDER_VARIABLE} to the folder that has {self.file}")
+        check_file(path, digest, self.name)
 
 
 def measured_folder() -> Path:
@@ -157,6 +169,12 @@ def read_case(name: Path | str) -> MeasuredCase:
         return MeasuredCase(path.stem, **fixed, settings=entries)
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from None
+
+
+def check_file(path: Path, digest: str, case: str) -> None:
+    """Raise ``ValueError`` unless a file or folder exists and has the sha256 of a case."""
+    if (actual := file_sha256(path) if path.exists() else "nothing") != digest:
+        raise ValueError(f"{path} must have the sha256 {digest} of the case {case}, got {actual}")
 
 
 def file_sha256(path: Path) -> str:

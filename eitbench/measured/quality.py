@@ -51,7 +51,8 @@ def find_spikes(voltages: np.ndarray, injection_index: np.ndarray) -> np.ndarray
         if len(uses) < SPIKE_WINDOW:
             continue
         sample = voltages[uses[::-(-len(uses) // SPIKE_CHUNK)]]
-        size = np.sqrt(np.nanmean(np.nanmedian(sample, axis=0)**2))
+        channels = np.isfinite(sample).any(axis=0)
+        size = np.sqrt(np.mean(np.nanmedian(sample[:, channels], axis=0)**2))
         starts = np.clip(np.arange(len(uses)) - SPIKE_WINDOW // 2, 0, len(uses) - SPIKE_WINDOW)
         for begin in range(0, len(uses), SPIKE_CHUNK):        # large files stay on disk
             chunk = slice(begin, begin + SPIKE_CHUNK)

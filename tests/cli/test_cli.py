@@ -25,7 +25,7 @@ from tiny import git_says, write_baseline
 ROOT = Path(__file__).parents[2]
 PIPE, INJECTION = "eitbench/Pipe2D-v0", "eitbench/Pipe2DInjection-v0"
 COMMANDS = ("list", "run", "bank", "train", "submit", "verify", "golden",
-            "fit", "estimate", "export", "leaderboard", "compare", "render")
+            "fit", "estimate", "fetch", "export", "leaderboard", "compare", "render")
 MINE = '''"""My method: the expected level everywhere."""
 import numpy as np
 from eitbench import Estimate

@@ -60,7 +60,7 @@ def test_missing_data_are_named(tmp_path, monkeypatch):
     case = read_case("iirc")
     with pytest.raises(ValueError, match=rf"iirc_data_2006\.mat with sha256 {case.sha256}, from .*eidors") as caught:
         gym.make("eitbench/Measured-iirc-v0")
-    assert f"Save it as {tmp_path / 'iirc_data_2006.mat'}" in str(caught.value)
+    assert f"Run `eitbench fetch iirc`, save it as {tmp_path / 'iirc_data_2006.mat'}" in str(caught.value)
     code, _, err = eitbench("run", "--env", "eitbench/Measured-iirc-v0", "--baseline", "homogeneous",
                             "--out", tmp_path / "out")
     assert code == 2
