@@ -66,7 +66,7 @@ def test_a_folder_is_extracted_without_others(server, tmp_path):
 
 
 def test_nothing_is_kept_of_a_wrong_download(server, tmp_path):
-    """Another sha256, a missing file, a file that is no archive, an unreachable server, a case without address."""
+    """Another sha256, a missing file, a file instead of an archive, an unreachable server, a case without address."""
     offered, address = server
     folder = f"{address}/repository-abc/sub/"
     for given, changes, message in [
