@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from eitbench.estimation.design import pair_design_criteria
+from eitbench.estimation.design import pair_design_criteria, symmetric_entries
 from eitbench.estimation.onboard.linearisation import electrode_pairs
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -17,13 +17,15 @@ def a_state(seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     rng = np.random.default_rng(seed)
     roots = rng.normal(size=(2, N, N))
     covariance, weight = roots @ roots.swapaxes(1, 2)
-    return rng.normal(size=(L, L, N)), covariance, weight, rng.uniform(0.1, 10.0, (len(PAIRS), L))
+    derivative = rng.normal(size=(L, L, N))
+    return derivative + derivative.swapaxes(0, 1), covariance, weight, rng.uniform(0.1, 10.0, (len(PAIRS), L))
 
 
 def gains_of(derivative, covariance, weight, noise_variance):
-    rows = derivative.reshape(L * L, N)
+    entries, number = symmetric_entries(L)
+    rows = derivative.reshape(L * L, N)[entries]
     plain, weighted = (rows @ middle @ rows.T for middle in (covariance, covariance @ weight @ covariance))
-    return pair_design_criteria(plain.reshape(L, L, L, L), weighted.reshape(L, L, L, L), PAIRS, noise_variance)
+    return pair_design_criteria(plain, weighted, number, PAIRS, noise_variance)
 
 
 def textbook(matrix: np.ndarray, covariance: np.ndarray, noise_variance: np.ndarray) -> np.ndarray:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from eitbench.data.episode_cache import scoring_constants
-from eitbench.estimation.design import pair_design_criteria
+from eitbench.estimation.design import pair_design_criteria, symmetric_entries
 from eitbench.estimation.onboard.body_belief import BodyBelief, PolicyBelief
 from eitbench.estimation.onboard.linearisation import linearisation_table
 from eitbench.estimation.onboard.reduced_filters import ReducedFilters
@@ -172,15 +172,16 @@ class Belief(PolicyBelief):
         score 0. By default ``jacobian`` is `jacobian`, and ``weight`` is for present errors in the
         scored region.
         """
-        L = self.rules.pairs.max() + 1
-        D = (self.jacobian if jacobian is None else jacobian).reshape(L * L, -1)
+        jacobian = self.jacobian if jacobian is None else jacobian
+        entries, number = symmetric_entries(len(jacobian))
+        D = jacobian.reshape(len(jacobian)**2, -1)[entries]
         DP = D @ covariance
         variance = self._noise_variance
         if healthy is not None:
             variance = np.where(healthy, variance, np.inf)
         weight = self._weight if weight is None else weight
-        tables = ((DP @ D.T).reshape(L, L, L, L), (DP @ weight @ DP.T).reshape(L, L, L, L))
-        criteria = pair_design_criteria(*tables, self.rules.pairs, variance)
+        criteria = pair_design_criteria(DP @ D.T, DP @ weight @ DP.T, number, self.rules.pairs,
+                                        variance)
         if healthy is not None:
             usable = healthy[self.rules.pairs].all(axis=1)
             criteria = criteria[0] * usable, criteria[1] * usable

@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import scipy.sparse as sp
 
-from eitbench.estimation.body_particles import SIGNAL_ERROR, measured_first
+from eitbench.estimation.body_particles import SIGNAL_ERROR
+from eitbench.estimation.design import pair_design_criteria, symmetric_entries
 from eitbench.estimation.onboard.body_filters import BodyFilters
 from eitbench.worlds.bodies import reflect
 
@@ -38,21 +39,13 @@ class BodyBelief(PolicyBelief):
         self.rules = rules
         self._filters = BodyFilters(rules, observation["frame"][None])
         model = self._filters.filter.model
-        self._patches = self._filters.patches.shape[0]
-        L = len(model.resistance)
-        entries = np.triu_indices(L)                            # 𝓡 is symmetric
-        number = np.empty((L, L), dtype=int)
-        number[entries] = number.T[entries] = np.arange(len(entries[0]))
-        signals = rules.amplitude * model.signals.reshape(L, L, -1)[entries]
+        entries, self._number = symmetric_entries(len(model.resistance))
+        signals = rules.amplitude * model.signals[entries]
         self._functionals = np.vstack([signals, self._filters.patches.toarray()]).T.copy()
-        """(G, entries of 𝓡 and patches) of a body at each grid point"""
-        pair_currents = rules.action_currents[:len(rules.pairs)]
-        mask = rules.instrument.measurement_mask(pair_currents)
-        electrodes, self._measured = measured_first(mask)
-        std = model.noise_std(pair_currents @ model.resistance)
-        self._variance = np.take_along_axis(std**2, electrodes, axis=1)
-        source, sink = rules.pairs.T[:, :, None]
-        self._from, self._to = number[electrodes, source], number[electrodes, sink]
+        """(G, N + patches) entries of 𝓡 and patches, of a body at each grid point"""
+        currents = rules.action_currents[:len(rules.pairs)]
+        self._variance = np.where(rules.instrument.measurement_mask(currents),
+                                  model.noise_std(currents @ model.resistance)**2, np.inf)
 
     def update(self, observation: dict[str, np.ndarray]) -> None:
         """Assimilate the outcome of the last injection."""
@@ -81,13 +74,10 @@ class BodyBelief(PolicyBelief):
         mean = weights @ functionals
         deviation = functionals - mean
         covariance = deviation.T @ (weights[:, None] * deviation)
-        i, j = self._from, self._to
-        S = sum(sign * covariance[one[:, :, None], two[:, None]]
-                for one, two, sign in ((i, i, 1), (i, j, -1), (j, i, -1), (j, j, 1)))
-        second = np.diagonal(S, axis1=1, axis2=2) + (mean[i] - mean[j])**2
-        root = self._measured / np.sqrt(self._variance + SIGNAL_ERROR**2 * second)
-        S = S * root[:, :, None] * root[:, None] + np.eye(root.shape[1])
-        patches = slice(-self._patches, None)
-        cross = (covariance[i, patches] - covariance[j, patches]) * root[..., None]
-        gains = (np.linalg.inv(S) * (cross @ np.swapaxes(cross, 1, 2))).sum(axis=(1, 2))
-        return gains, 0.5 * np.linalg.slogdet(S)[1]
+        N = self._number.max() + 1
+        i, j = self._number[self.rules.pairs].swapaxes(0, 1)
+        variance = np.diagonal(covariance)
+        square = variance[i] + variance[j] - 2.0 * covariance[i, j] + (mean[i] - mean[j])**2
+        cross = covariance[:N, N:]
+        return pair_design_criteria(covariance[:N, :N].copy(), cross @ cross.T, self._number,
+                                    self.rules.pairs, self._variance + SIGNAL_ERROR**2 * square)
