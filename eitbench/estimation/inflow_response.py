@@ -104,15 +104,14 @@ def _changing(transport_at: Callable[[int], Transport],
 
 def _steady(transport: Transport) -> list[np.ndarray]:
     """Return Fᵏ Y (n, n_inlet) for k = 0, 1, … until it has decayed."""
-    F, Y = transport.transition()
-    if not Y.shape[1]:
+    if not len(transport.inlet):
         raise ValueError("the transport must have an inlet, got one without")
-    parts = [Y]
-    while np.linalg.norm(parts[-1]) > DECAY_TOLERANCE * np.linalg.norm(Y):
+    parts = [one_step_response(transport)]
+    while np.linalg.norm(parts[-1]) > DECAY_TOLERANCE * np.linalg.norm(parts[0]):
         if len(parts) == MAX_RESPONSE_STEPS:
             raise ValueError("the transport must have a response that decays within "
                              f"{MAX_RESPONSE_STEPS} steps")
-        parts.append(F @ parts[-1])
+        parts.append(transport.step(parts[-1], parts[-1][transport.inlet], 0.0))
     return parts
 
 
