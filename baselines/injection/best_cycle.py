@@ -25,7 +25,7 @@ class Policy:
         "environment_steps": {
             "Pipe2D": 346_368, "Pipe2D with faults": 608_768,
             "Pipe2DIntermittent with a budget": 768_768, "Pipe2DDriftingVelocity": 217_792,
-            "RotatingTank2D": 333_696, "TankTracking": 712_704, "SearchAndTrack": 746_496}}
+            "RotatingTank2D": 333_696, "TankTracking": 712_704, "SearchAndTrack": 844_800}}
 
     @classmethod
     def suits(cls, rules: Rules) -> bool:
