@@ -24,7 +24,8 @@ def mean_and_interval(values: list[float]) -> tuple[float, float]:
 
 
 def format_mean(mean: float, half: float) -> str:
-    """Format as ``0.0053 ± 0.0004``: one digit of the interval, two if it or the mean needs two."""
+    """Format as ``0.0053 ± 0.0004``: one digit of the interval, two if it or the mean needs two. A
+    small positive mean is not rounded to zero, as after few episodes."""
     place = _places(half, mean)
     return f"{mean:.3g}" if place is None else f"{mean:z.{place}f} ± {half:.{place}f}"
 
@@ -42,7 +43,7 @@ def _places(half: float, value: float) -> int | None:
     if not math.isfinite(half) or half < 5e-6:
         return None
     place = -math.floor(math.log10(half))
-    if round(half * 10**place) == 1 or 1 <= abs(value) * 10**place < 10:
+    if round(half * 10**place) == 1 or 0.05 <= abs(value) * 10**place < 10:
         place += 1
     return min(max(place, 0), 5)
 
