@@ -492,28 +492,31 @@ def particle_likelihoods(signals, index, shares, weights, currents, electrodes, 
     B, P, _ = index.shape
     m = electrodes.shape[1]
     L = currents.shape[1]
-    deviations = np.empty((P, m))
+    deviations, growth = np.empty((P, m)), np.empty(P)
+    change = np.empty(signals.shape[1])
     for b in range(B):
         driven = np.flatnonzero(currents[b])
         used = np.flatnonzero(measured[b])
-        for p in range(P):
-            growth = 1.0
-            for a in used:
+        growth[:] = 1.0
+        for a in used:
+            change[:] = 0.0                         # small enough for the fastest CPU cache
+            for d in driven:
+                row = L * electrodes[b, a] + d
+                for g in range(len(change)):
+                    change[g] += currents[b, d] * signals[row, g]
+            for p in range(P):
                 signal = 0.0
-                for d in driven:
-                    row = L * electrodes[b, a] + d
-                    for k in range(4):
-                        signal += (currents[b, d] * shares[b, p, k]
-                                   * signals[row, index[b, p, k]])
+                for k in range(4):
+                    signal += shares[b, p, k] * change[index[b, p, k]]
                 rest = residual[b, a] - signal
                 spread = variance[b, a] + (relative_error * signal)**2
                 logarithm[b, p] -= 0.5 * rest * rest / spread
-                growth *= spread / variance[b, a]
+                growth[p] *= spread / variance[b, a]
                 deviations[p, a] = rest
                 mean[b, a] += weights[b, p] * rest
                 covariance[b, a, a] += weights[b, p] * spread
-            logarithm[b, p] -= 0.5 * math.log(growth)
         for p in range(P):
+            logarithm[b, p] -= 0.5 * math.log(growth[p])
             for a in used:
                 for c in used:
                     covariance[b, a, c] += (weights[b, p] * (deviations[p, a] - mean[b, a])
