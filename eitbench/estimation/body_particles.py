@@ -19,7 +19,6 @@ from eitbench.worlds.bodies import (
     reflect,
 )
 from eitbench.worlds.task import Estimate
-from eitbench.worlds.vessels import RoundTank
 
 if TYPE_CHECKING:
     from eitbench.physics.observation import ObservationModel
@@ -61,12 +60,13 @@ class BodyModel:
     """
 
     def __init__(self, task: Task) -> None:
-        assert isinstance(task.vessel, RoundTank) and task.body is not None
+        assert task.body is not None, "the task must have a body"
         self.target = target = task.body
+        vessel: Any = task.vessel
         observation, mesh = task.observation, task.mesh
-        self.mesh, self.noise, self.time_step = mesh, task.noise, task.transport.time_step
+        self.noise, self.time_step = task.noise, task.transport.time_step
         self.radius = float(np.mean(target.radius_range))
-        self.limit = task.vessel.radius - self.radius
+        self.limit = vessel.radius - self.radius
         self.side = 2 * math.ceil(self.limit / SPACING) + 1
         """grid points along x and y"""
         axis = SPACING * (np.arange(self.side) - self.side // 2)
