@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import lru_cache
+from textwrap import fill
 
 import numpy as np
 import scipy.sparse as sp
@@ -140,7 +141,7 @@ def draw_comparison(task: Task, fields: list[tuple[str, Mesh, np.ndarray]], curr
     panels = figure.subplots(*((1, len(fields)) if tank else (len(fields), 1)), squeeze=False).flat
     for axes, (title, mesh, values) in zip(panels, fields, strict=True):
         mappable = draw_field(axes, mesh, values, *colour_range(task))
-        axes.set_title(title, loc="left", fontsize=11)
+        axes.set_title(fill(title, 34 if tank else 80), loc="left", fontsize=10 if tank else 11)
         axes.set(xticks=(), yticks=(), ylabel="")
         draw_electrodes(axes, task, currents)
     figure.colorbar(mappable, ax=list(figure.axes), location="bottom", aspect=50, shrink=0.8,
