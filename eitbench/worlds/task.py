@@ -80,7 +80,7 @@ class Task:
     world : str
         Name of the world, by which trained models are found.
     body : WanderingBody, optional
-        Contrast, sizes and motion of a body that moves by itself; not those of an episode.
+        Conductivity, range of sizes, and speeds of a body that moves by itself.
     """
 
     transport: Transport

@@ -142,8 +142,8 @@ def test_belief_is_the_filter_inside(id):
 
 
 def test_tracker_is_the_filter_of_an_episode():
-    """It finds from NaN which voltages are measured, and its moments are those of the images, which are interpolated
-    on the grid as their squares are."""
+    """NaN marks voltages that are not measured. Its moments are expectations of images, and of their squares, which are
+    interpolated on the grid."""
     world = rules_of().world
     task, episode = make_task(world), simulate(world, 3, progress=False)
     tracker, filters = BodyTracker(task), BodyParticleFilter(body_model(task), 1)

@@ -41,6 +41,7 @@ COMMANDS = [
     (("fit", "prior", "--env", "eitbench/Pipe2D-v0", "--seeds", "train:0-3", "-o", "prior.json"), "prior.json: "),
     (("fit", "model", "--env", "eitbench/Pipe2D-v0", "--seeds", "train:0-1", "-o", "model.npz"), "model.npz: "),
     (("estimate", "--help"), "vessel"),
+    (("fetch", "--help"), "sha256"),
 ]
 """Command-line arguments, and a part of the output of a successful run."""
 ONE_PROCESS = """
