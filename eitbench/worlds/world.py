@@ -345,9 +345,8 @@ class World:
         seed = _check.integer("seed", seed, low=0)
         if not hasattr(self.target, "draw_inflow"):
             raise ValueError(f"the target must have an inflow, got {type(self.target).__name__}")
-        mesh, inlet = self.vessel.transport_mesh(fine=False)
+        points = _inlet_points(self.vessel)
         inflow = self.target.draw_inflow(self, episode_streams(seed).inflow)
-        points = mesh.points[np.unique(inlet)]
         return np.array([inflow(points, t * self.time_step)
                          for t in range(-self.spin_up_steps, self.n_steps + 1)])
 
@@ -425,6 +424,13 @@ class World:
                                 contact_impedance_spread=self.instrument.contact_impedance_spread)
         prior = Prior(self.expected_concentration)
         return replace(self.fault_free, instrument=instrument, prior=prior)
+
+
+@lru_cache(maxsize=8)
+def _inlet_points(vessel: Vessel) -> np.ndarray:
+    """Return the nodes (n_inlet, d) of the estimators' inlet in m."""
+    mesh, inlet = vessel.transport_mesh(fine=False)
+    return mesh.points[np.unique(inlet)]
 
 
 def _check_part(name: str, part: Any, protocol: type) -> None:
