@@ -79,11 +79,12 @@ def model_key(name: str, configuration: Any, version: int) -> Key:
     return Key("models", f"{name}-{_digest([configuration, version])[:16]}")
 
 
-def cached(key: Key, build: Callable[[], Arrays]) -> dict[str, np.ndarray]:
+def cached(key: Key, build: Callable[[], Arrays], limit: int = 0) -> dict[str, np.ndarray]:
     """Return the arrays of a key, read-only: shipped, memory-mapped from the cache, or built.
 
     A file that is missing, damaged or of another key is built again and replaced. A cache that
-    cannot be written causes a warning.
+    cannot be written causes a warning. With a ``limit`` the oldest files of this kind, whose names
+    agree up to the dash, are deleted if there are more.
     """
     for load in (load_shipped, _load):
         if (found := load(key)) is not None:
@@ -91,6 +92,9 @@ def cached(key: Key, build: Callable[[], Arrays]) -> dict[str, np.ndarray]:
     built = build()
     try:
         store(key, built)
+        kind = key.path.parent.glob(f"{key.name.partition('-')[0]}-*.npy")
+        for old in sorted(kind, key=lambda path: path.stat().st_mtime)[:-limit] if limit else ():
+            old.unlink()
     except OSError as error:
         warn_cache_unwritable(key.path.parent, error)
     return _fields(_record(built))

@@ -36,6 +36,8 @@ FILTER_RANK_TOLERANCE = 1e-4
 deviations, in a quarter of the time for n = 3,003 (``docs/pipe3d.md``)."""
 OPEN_LOOP_VERSION = 1
 """Version of stored open-loop covariances."""
+MAX_STORED_OPEN_LOOPS = 12
+"""A file has 76 MB for 1,701 nodes; the size grows with the square of their number."""
 OPEN_LOOP_SECONDS = 2.5
 """Time on one core for 1,000 nodes; it grows with the third power of their number."""
 
@@ -252,7 +254,7 @@ def _open_loop(transport: Transport, prior: Prior) -> OpenLoopCovariance:
 
     known_by = [array_digest(F, Y, transport.mesh.points), config_dict(prior)]
     key = model_key("open_loop", known_by, OPEN_LOOP_VERSION)
-    return OpenLoopCovariance(F, **cached(key, build))
+    return OpenLoopCovariance(F, **cached(key, build, limit=MAX_STORED_OPEN_LOOPS))
 
 
 @lru_cache(maxsize=4)

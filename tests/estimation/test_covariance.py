@@ -82,7 +82,11 @@ def test_open_loop_covariance_is_cached_for_a_flow_and_a_prior(tmp_path, monkeyp
         for t in TIMES:
             assert np.array_equal(read.diagonal(t), built.diagonal(t))
         others = [covariance(velocity=1.1), covariance(inflow_std=0.3), covariance(initial_length=0.02)]
-    assert len(list(tmp_path.rglob("open_loop*"))) == 4
+        assert len(list(tmp_path.rglob("open_loop*"))) == 4
+        with monkeypatch.context() as patch:
+            patch.setattr(nodal, "MAX_STORED_OPEN_LOOPS", 2)
+            covariance(velocity=1.2)
+    assert len(list(tmp_path.rglob("open_loop*"))) == 2
     assert all(not np.allclose(each.limit + each.diagonal(0), built.limit + built.diagonal(0)) for each in others)
 
 
