@@ -9,8 +9,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from eitbench.numerics.compiled import compiled_kernels
-
 
 def symmetric_entries(n_electrodes: int) -> tuple[np.ndarray, np.ndarray]:
     """Return the indices (N,) of the upper triangle in 𝓡 (L, L) as L² numbers, and the row (L, L)
@@ -23,7 +21,7 @@ def symmetric_entries(n_electrodes: int) -> tuple[np.ndarray, np.ndarray]:
 
 def pair_design_criteria(
         voltage_covariance: np.ndarray, weighted_voltage_covariance: np.ndarray,
-        number: np.ndarray, pairs: np.ndarray,
+        entries: tuple[np.ndarray, np.ndarray],
         noise_variance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the A- and D-criterion of an injection through each pair, (p,) and (p,).
 
@@ -36,14 +34,22 @@ def pair_design_criteria(
         D P Dᵀ, with the state's covariance P just before the measurement.
     weighted_voltage_covariance : (N, N)
         D P W P Dᵀ, with the weight W of state errors.
-    number : (L, L)
-        Row of D of each entry, from `symmetric_entries`.
-    pairs : (p, 2)
-        Electrodes where the current enters and leaves.
-    noise_variance : (p, L)
-        Noise of each pair's voltages, per current squared; infinite for rejected measurements.
+    entries : (p, m) and (p, m)
+        Rows of D whose difference is the derivative of each of a pair's m voltages, from
+        `symmetric_entries`: of the electrodes where the current enters and leaves.
+    noise_variance : (p, m)
+        Noise of the voltages, per current squared; infinite for rejected measurements.
     """
-    gains, information = np.zeros((2, len(pairs)))
-    compiled_kernels().pair_criteria(voltage_covariance, weighted_voltage_covariance, number,
-                                     pairs, 1.0 / np.sqrt(noise_variance), gains, information)
-    return gains, information
+    i, j = entries
+    root = 1.0 / np.sqrt(noise_variance)              # zero for rejected measurements
+    scale = root[:, :, None] * root[:, None, :]
+    flat = [one[:, :, None] * len(voltage_covariance) + other[:, None, :]
+            for one, other in ((i, i), (i, j), (j, j))]
+
+    def scaled(table: np.ndarray) -> np.ndarray:
+        entering, mixed, leaving = (table.take(each) for each in flat)
+        return scale * (entering + leaving - mixed - mixed.swapaxes(1, 2))
+
+    S = scaled(voltage_covariance) + np.eye(root.shape[1])
+    gains = (np.linalg.inv(S) * scaled(weighted_voltage_covariance)).sum(axis=(1, 2))
+    return gains, 0.5 * np.linalg.slogdet(S)[1]

@@ -524,47 +524,6 @@ def particle_likelihoods(signals, index, shares, weights, currents, electrodes, 
 
 
 @njit(cache=True)
-def pair_criteria(voltages, learnt, number, pairs, root, gains, information):
-    """Compute the criteria (p,) of `eitbench.estimation.design.pair_design_criteria`, with ``root``
-    (p, L) the inverse standard deviation of the noise."""
-    L = root.shape[1]
-    S, T = np.empty((L, L)), np.empty((L, L))
-    for p in range(len(pairs)):
-        i, j = pairs[p]
-        used = np.flatnonzero(root[p])
-        m = len(used)
-        for a in range(m):
-            ai, aj = number[used[a], i], number[used[a], j]
-            for c in range(m):
-                ci, cj = number[used[c], i], number[used[c], j]
-                scale = root[p, used[a]] * root[p, used[c]]
-                S[a, c] = scale * (voltages[ai, ci] - voltages[ai, cj]
-                                   - voltages[aj, ci] + voltages[aj, cj])
-                T[a, c] = scale * (learnt[ai, ci] - learnt[ai, cj]
-                                   - learnt[aj, ci] + learnt[aj, cj])
-            S[a, a] += 1.0
-        # S = G Gᵀ in place; then T ← G⁻¹ T and the lower triangle of T ← T G⁻ᵀ
-        for a in range(m):
-            for c in range(a + 1):
-                total = S[a, c]
-                for k in range(c):
-                    total -= S[a, k] * S[c, k]
-                S[a, c] = math.sqrt(total) if a == c else total / S[c, c]
-            information[p] += math.log(S[a, a])
-            for k in range(a):
-                for c in range(m):
-                    T[a, c] -= S[a, k] * T[k, c]
-            for c in range(m):
-                T[a, c] /= S[a, a]
-        for a in range(m):
-            for c in range(a + 1):
-                for k in range(c):
-                    T[a, c] -= T[a, k] * S[c, k]
-                T[a, c] /= S[c, c]
-            gains[p] += T[a, a]
-
-
-@njit(cache=True)
 def add_columns(pointers, rows, values, weights, totals):
     """Add a sparse matrix by columns times ``weights`` (B, columns) to ``totals`` (B, rows)."""
     for b in range(len(weights)):

@@ -25,7 +25,7 @@ def gains_of(derivative, covariance, weight, noise_variance):
     entries, number = symmetric_entries(L)
     rows = derivative.reshape(L * L, N)[entries]
     plain, weighted = (rows @ middle @ rows.T for middle in (covariance, covariance @ weight @ covariance))
-    return pair_design_criteria(plain, weighted, number, PAIRS, noise_variance)
+    return pair_design_criteria(plain, weighted, number[PAIRS.T], noise_variance)
 
 
 def textbook(matrix: np.ndarray, covariance: np.ndarray, noise_variance: np.ndarray) -> np.ndarray:

@@ -180,8 +180,8 @@ class Belief(PolicyBelief):
         if healthy is not None:
             variance = np.where(healthy, variance, np.inf)
         weight = self._weight if weight is None else weight
-        criteria = pair_design_criteria(DP @ D.T, DP @ weight @ DP.T, number, self.rules.pairs,
-                                        variance)
+        criteria = pair_design_criteria(DP @ D.T, DP @ weight @ DP.T,
+                                        number[self.rules.pairs.T], variance)
         if healthy is not None:
             usable = healthy[self.rules.pairs].all(axis=1)
             criteria = criteria[0] * usable, criteria[1] * usable

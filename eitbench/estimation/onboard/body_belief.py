@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import scipy.sparse as sp
 
-from eitbench.estimation.body_particles import SIGNAL_ERROR
+from eitbench.estimation.body_particles import SIGNAL_ERROR, measured_first
 from eitbench.estimation.design import pair_design_criteria, symmetric_entries
 from eitbench.estimation.onboard.body_filters import BodyFilters
 from eitbench.worlds.bodies import reflect
@@ -39,13 +39,15 @@ class BodyBelief(PolicyBelief):
         self.rules = rules
         self._filters = BodyFilters(rules, observation["frame"][None])
         model = self._filters.filter.model
-        entries, self._number = symmetric_entries(len(model.resistance))
+        entries, number = symmetric_entries(len(model.resistance))
         signals = rules.amplitude * model.signals[entries]
         self._functionals = np.vstack([signals, self._filters.patches.toarray()]).T.copy()
         """(G, N + patches) entries of 𝓡 and patches, of a body at each grid point"""
         currents = rules.action_currents[:len(rules.pairs)]
-        self._variance = np.where(rules.instrument.measurement_mask(currents),
-                                  model.noise_std(currents @ model.resistance)**2, np.inf)
+        electrodes, measured = measured_first(rules.instrument.measurement_mask(currents))
+        std = np.take_along_axis(model.noise_std(currents @ model.resistance), electrodes, axis=1)
+        self._variance = np.where(measured, std**2, np.inf)
+        self._entries = number[rules.pairs.T[:, :, None], electrodes]
 
     def update(self, observation: dict[str, np.ndarray]) -> None:
         """Assimilate the outcome of the last injection."""
@@ -74,10 +76,9 @@ class BodyBelief(PolicyBelief):
         mean = weights @ functionals
         deviation = functionals - mean
         covariance = deviation.T @ (weights[:, None] * deviation)
-        N = self._number.max() + 1
-        i, j = self._number[self.rules.pairs].swapaxes(0, 1)
+        i, j = self._entries
         variance = np.diagonal(covariance)
         square = variance[i] + variance[j] - 2.0 * covariance[i, j] + (mean[i] - mean[j])**2
-        cross = covariance[:N, N:]
-        return pair_design_criteria(covariance[:N, :N].copy(), cross @ cross.T, self._number,
-                                    self.rules.pairs, self._variance + SIGNAL_ERROR**2 * square)
+        cross = covariance[:, -self._filters.patches.shape[0]:]
+        return pair_design_criteria(covariance, cross @ cross.T, self._entries,
+                                    self._variance + SIGNAL_ERROR**2 * square)
