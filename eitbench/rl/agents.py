@@ -82,14 +82,6 @@ class _ModelPolicy(AgentPolicy):
         self._is_first = True
 
     def choose(self, observation: np.ndarray, mask: np.ndarray) -> Any:
-        policy = self.model.policy
-        if len(mask) and hasattr(policy, "action_net") and not hasattr(policy, "lstm_actor"):
-            # `predict` takes twice as long
-            import torch
-            with torch.inference_mode():
-                features = policy.extract_features(torch.from_numpy(observation)[None])
-                scores = policy.action_net(policy.mlp_extractor.forward_actor(features))[0].numpy()
-            return int(np.where(mask | (not self.uses_action_masks), scores, -np.inf).argmax())
         masks = {"action_masks": mask} if self.uses_action_masks else {}
         action, self._hidden_state = self.model.predict(
             observation, state=self._hidden_state, episode_start=np.array([self._is_first]),
