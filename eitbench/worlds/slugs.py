@@ -110,14 +110,9 @@ class Slugs(Target):
         duration = random.uniform(*self.time_std, n)
         width = random.uniform(*self.transverse_std, n)
 
-        @lru_cache(maxsize=4)
-        def bells(coordinates: bytes) -> np.ndarray:
-            """Return the slugs' profiles (k, n), which do not depend on time."""
-            distance = np.frombuffer(coordinates).reshape(-1, 1, where.shape[1]) - where
-            return np.asarray(np.exp(-0.5 * ((distance / width[:, None])**2).sum(axis=2)))
-
         def inflow(points: np.ndarray, time: float) -> np.ndarray:
-            bell = bells(world.vessel.transverse_coordinates(points).tobytes())
+            distance = world.vessel.transverse_coordinates(points)[:, None] - where  # (k, n, d − 1)
+            bell = np.exp(-0.5 * ((distance / width[:, None])**2).sum(axis=2))
             strengths = strength * np.exp(-0.5 * ((time - when) / duration)**2)
             return np.asarray(self.background * np.exp(bell @ strengths))
 
