@@ -7,16 +7,16 @@ in SI units and have all their digits, as in the records.
 from __future__ import annotations
 
 import csv
-import gzip
 import io
 import json
+import lzma
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
 from eitbench._files import write_atomically
 
-TABLE_NAME = "episodes.csv.gz"
+TABLE_NAME = "episodes.csv.xz"
 _OF_RECORDS = ("board", "method", "version", "title", "role", "privileged", "official", "split")
 _COLUMNS = ("id", "environment", "kwargs", *_OF_RECORDS, "finished", "seed", "status",
             "peak_memory")
@@ -29,9 +29,9 @@ def table_path(folder: Path) -> Path:
 
 
 def write_episode_table(records: Iterable[dict[str, Any]], path: Path) -> None:
-    """Write the episodes of records as compressed CSV, atomically; for one version of zlib the
+    """Write the episodes of records as compressed CSV, atomically; for one version of liblzma the
     bytes depend on the records only."""
-    content = gzip.compress(episode_table(records).encode(), mtime=0)
+    content = lzma.compress(episode_table(records).encode(), preset=9)
     write_atomically(path, content)
 
 
@@ -56,13 +56,13 @@ def read_episode_table(path: Path) -> list[dict[str, Any]]:
     ``ValueError``, naming the file, if it is damaged."""
     records: dict[tuple[str, ...], dict[str, Any]] = {}
     try:
-        text = gzip.decompress(Path(path).read_bytes()).decode()
+        text = lzma.decompress(Path(path).read_bytes()).decode()
         for row in csv.DictReader(io.StringIO(text)):
             key = tuple(row[name] for name in ("environment", "method", "version", "split"))
             record = records.get(key) or records.setdefault(key, _record(row))
             record["seeds"].append(row["seed"])
             record["episodes"].append(_episode(row))
-    except (OSError, EOFError, KeyError, ValueError) as error:
+    except (OSError, lzma.LZMAError, KeyError, ValueError) as error:
         raise ValueError(f"table of episodes {path} cannot be read: {error}") from None
     return list(records.values())
 

@@ -156,7 +156,7 @@ def leaderboard(
     out: options.Out = Path("results"),
     records: Annotated[Path | None, typer.Option(
         help="Folder of the leaderboards' records, such as leaderboards/results: render "
-             "leaderboard.csv, leaderboard.md, episodes.csv.gz and the pages site/ next to it "
+             "leaderboard.csv, leaderboard.md, episodes.csv.xz and the pages site/ next to it "
              "instead.")] = None,
     env: options.Environments = None,
 ) -> None:

@@ -1,6 +1,6 @@
 """The table of episodes in the package has the same scores as the records."""
 
-import gzip
+import lzma
 import re
 
 import pandas as pd
@@ -19,7 +19,7 @@ RESULTS = bundled_path("leaderboards") / "results"
 
 def test_the_published_table_agrees_with_the_records():
     """`eitbench leaderboard --records leaderboards/results` would not change it, and `load` returns the same data."""
-    text = gzip.decompress((RESULTS.parent / TABLE_NAME).read_bytes()).decode()
+    text = lzma.decompress((RESULTS.parent / TABLE_NAME).read_bytes()).decode()
     assert text == episode_table(read_records(RESULTS)), "run `eitbench leaderboard --records leaderboards/results`"
     pd.testing.assert_frame_equal(load(RESULTS.parent / "none"), load(), check_exact=True)
 
@@ -68,8 +68,8 @@ def test_compare_and_skill_need_no_records(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("damage", [
-    lambda data: data[:-9], lambda data: b"no gzip", lambda data: gzip.compress(b"a\n1\n"),
-    lambda data: gzip.compress(gzip.decompress(data)[:-3] + b"x,y\n")])
+    lambda data: data[:-9], lambda data: b"no lzma", lambda data: lzma.compress(b"a\n1\n"),
+    lambda data: lzma.compress(lzma.decompress(data)[:-3] + b"x,y\n")])
 def test_a_damaged_table_is_named(damage, tmp_path):
     """The message contains the path."""
     write_episode_table(several_boards(), tmp_path / TABLE_NAME)

@@ -209,7 +209,7 @@ def test_from_a_file_to_the_leaderboards_by_command(tmp_path):
     assert eitbench("submit", "--policy", "random_pair", "--env", INJECTION, "--seeds", "test:0", "-j", "1")[0] == 0
     code, said, _ = eitbench("leaderboard", "--records", "leaderboards/results")
     assert said.splitlines() == [f"wrote leaderboards/{name}" for name in (
-        "leaderboard.csv", "leaderboard.md", "site/index.html", "episodes.csv.gz")]
+        "leaderboard.csv", "leaderboard.md", "site/index.html", "episodes.csv.xz")]
     assert "Mine" in (tmp_path / "leaderboards" / "site" / "methods" / "mine.html").read_text(encoding="utf-8")
     text = (tmp_path / "leaderboards" / "leaderboard.md").read_text(encoding="utf-8")
     assert re.search(r"\| +1 +\| Mine mine@\w{8} +\|.*\| self-reported \|", text)

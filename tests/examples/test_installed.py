@@ -77,7 +77,7 @@ def test_the_wheel_is_small_and_whole(installed):
     (wheel,) = (installed.folder / "wheels").glob("eitbench-*.whl")
     assert wheel.stat().st_size < 5e6
     names = set(zipfile.ZipFile(wheel).namelist())
-    assert {"eitbench/py.typed", "eitbench/leaderboards/schema.json", "eitbench/leaderboards/episodes.csv.gz",
+    assert {"eitbench/py.typed", "eitbench/leaderboards/schema.json", "eitbench/leaderboards/episodes.csv.xz",
             "eitbench/baselines/rl/ppo.yml"} <= names
     assert not [name for name in names if name.startswith("eitbench/leaderboards/results")]
     assert not [name for name in names if Path(name).suffix in (".zip", ".webp", ".html")
