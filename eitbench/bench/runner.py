@@ -116,8 +116,6 @@ def run_on_measurements(env: MeasuredEnv, method: str | Method, seed: int = 0, *
 def _motion(task: Task) -> str:
     if task.is_stationary:
         return "is stationary"
-    if task.body is not None:
-        return "moves by itself"
     if isinstance(task.transport, RandomWalk):
         return "follows a random walk"
     return f"is advected by a flow that is {'known' if task.velocity is None else 'estimated'}"

@@ -17,7 +17,7 @@ import os
 import warnings
 import zlib
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import fields, is_dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -92,12 +92,19 @@ def cached(key: Key, build: Callable[[], Arrays], limit: int = 0) -> dict[str, n
     built = build()
     try:
         store(key, built)
-        kind = key.path.parent.glob(f"{key.name.partition('-')[0]}-*.npy")
-        for old in sorted(kind, key=lambda path: path.stat().st_mtime)[:-limit] if limit else ():
-            old.unlink()
     except OSError as error:
         warn_cache_unwritable(key.path.parent, error)
+    if limit:
+        _delete_oldest(key, limit)
     return _fields(_record(built))
+
+
+def _delete_oldest(key: Key, limit: int) -> None:
+    """Delete the oldest files of this kind; another process may delete them at the same time."""
+    with suppress(OSError):
+        files = list(key.path.parent.glob(f"{key.name.partition('-')[0]}-*.npy"))
+        for old in sorted(files, key=os.path.getmtime)[:-limit]:
+            old.unlink()
 
 
 def store(key: Key, arrays: Arrays) -> None:

@@ -63,7 +63,7 @@ def _download(address: str, path: Path) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     with urlopen(address, timeout=TIMEOUT_S) as reply, path.open("wb") as file, tqdm.wrapattr(
             reply, "read", total=int(reply.headers.get("Content-Length") or 0), desc=path.name,
-            disable=None, leave=False) as stream:
+            unit_scale=True, disable=None, leave=False) as stream:
         shutil.copyfileobj(stream, file)
 
 

@@ -459,6 +459,7 @@ Sizes, speeds and conductivity of the body are in `env.unwrapped.task.body`, its
 episode is not. A filter of its position has few unknowns; an image has one for each node, and no
 model of what moves.
 """)
+
 register_injection(TANK_TRACKING, "eitbench/TankTracking-v0", test_seeds="test:0-49",
                    is_starting_point=True, description=f"""
 Follow a body that moves by itself, with a few measurements of each injection. This environment is

@@ -68,7 +68,7 @@ def test_stationary_target_keeps_its_covariance(model):
 
 
 def test_open_loop_covariance_is_cached_for_a_flow_and_a_prior(tmp_path, monkeypatch):
-    """A second process reads the same bits; another flow or prior has its own file."""
+    """A second transport model of the same flow reads the same bits; another flow or prior has its own file."""
     def covariance(velocity=1.0, **prior):
         _, held = nodal_states(coarse_transport([velocity], 1e-2), Prior(**prior), 1.0).initial()
         return held.open_loop
@@ -87,7 +87,8 @@ def test_open_loop_covariance_is_cached_for_a_flow_and_a_prior(tmp_path, monkeyp
             patch.setattr(nodal, "MAX_STORED_OPEN_LOOPS", 2)
             covariance(velocity=1.2)
     assert len(list(tmp_path.rglob("open_loop*"))) == 2
-    assert all(not np.allclose(each.limit + each.diagonal(0), built.limit + built.diagonal(0)) for each in others)
+    for other in others:
+        assert not np.allclose(other.diagonal(0), built.diagonal(0)) or not np.allclose(other.limit, built.limit)
 
 
 def test_arguments_are_not_modified(model):
