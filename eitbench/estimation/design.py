@@ -46,10 +46,10 @@ def pair_design_criteria(
     flat = [one[:, :, None] * len(voltage_covariance) + other[:, None, :]
             for one, other in ((i, i), (i, j), (j, j))]
 
-    def scaled(table: np.ndarray) -> np.ndarray:
+    def whiten(table: np.ndarray) -> np.ndarray:
         entering, mixed, leaving = (table.take(each) for each in flat)
         return scale * (entering + leaving - mixed - mixed.swapaxes(1, 2))
 
-    S = scaled(voltage_covariance) + np.eye(root.shape[1])
-    gains = (np.linalg.inv(S) * scaled(weighted_voltage_covariance)).sum(axis=(1, 2))
+    S = whiten(voltage_covariance) + np.eye(root.shape[1])
+    gains = (np.linalg.inv(S) * whiten(weighted_voltage_covariance)).sum(axis=(1, 2))
     return gains, 0.5 * np.linalg.slogdet(S)[1]
