@@ -89,15 +89,12 @@ def check(name: str, *, is_quick: bool = False) -> list[str]:
         return [f"the golden file of {name} is damaged: {error}"]
     if expected is None:
         return [f"{name} has no golden file: {golden_path(name)} is missing"]
-    if name in tracks.builtin_ids():
-        computed = json.loads(world_text(world_golden(name, is_quick=is_quick)))
-        if is_quick:
-            expected |= {part: {seed: expected[part][seed] for seed in FAST_EPISODES}
-                         for part in ("episodes", "observations")}
-        return [f"{name}: {sentence}" for sentence in differences(computed, expected)]
-    if is_quick:
+    if is_quick and name in tracks.builtin_ids():
+        expected |= {part: {seed: expected[part][seed] for seed in FAST_EPISODES}
+                     for part in ("episodes", "observations")}
+    elif is_quick:
         expected["episodes"] = expected["episodes"][:1]
-    return _method_differences(expected, _method_golden(expected, golden_methods()[name]))
+    return _differences(name, _computed(name, expected, is_quick), expected)
 
 
 def update(names: list[str], *, new_version: bool = False) -> Iterator[tuple[str, str, list[str]]]:
@@ -114,39 +111,54 @@ def update(names: list[str], *, new_version: bool = False) -> Iterator[tuple[str
 
     ``ValueError`` if a name is neither a built-in id nor a built-in method.
     """
-    ids, known = tracks.builtin_ids(), golden_methods()
+    known = [*tracks.builtin_ids(), *golden_methods()]
     for name in names:
-        _check.choice("each of names", name, [*ids, *known])
-    for name in names or [*ids, *known]:
-        if name in known:
-            yield (name, *_update_method(name, known[name], new_version))
-        elif golden_path(name).is_file():
-            moved = check(name)
-            yield name, "moved" if moved else "same", moved
-        else:
-            write_atomically(golden_path(name), world_text(world_golden(name)).encode())
-            yield name, "new", []
+        _check.choice("each of names", name, known)
+    for name in names or known:
+        expected = read_golden(name)
+        computed = _computed(name, expected)
+        moved = _differences(name, computed, expected) if expected else []
+        status = "moved" if moved else "same" if expected else "new"
+        if status == "same" and "method" in expected:
+            # scores introduced after the file was written are added; the others stay bit for bit
+            computed = expected | {"episodes": [
+                old | {"scores": new["scores"] | old["scores"]}
+                for old, new in zip(expected["episodes"], computed["episodes"], strict=True)]}
+        elif status == "same":
+            computed = expected
+        elif new_version and moved and "method" in expected:
+            computed["version"] += 1
+            status = f"v{computed['version']}"
+        if status != "moved" and computed != expected:
+            write_atomically(golden_path(name), to_json(computed).encode())
+            methods.golden_version.cache_clear()
+        yield name, status, moved
 
 
-def _update_method(name: str, method: str, new_version: bool) -> tuple[str, list[str]]:
-    expected = read_golden(name)
-    computed = _method_golden(expected or _new_golden(name, method), method)
-    moved = _method_differences(expected, computed) if expected else []
-    if moved and not new_version:
-        return "moved", moved
-    if expected and not moved:
-        # Scores introduced after the file was written are added; the others stay bit for bit.
-        computed = expected | {"episodes": [
-            old | {"scores": new["scores"] | old["scores"]}
-            for old, new in zip(expected["episodes"], computed["episodes"], strict=True)]}
-        status = "same"
-    else:
-        computed["version"] = expected["version"] + 1 if expected else 1
-        status = f"v{computed['version']}" if expected else "new"
-    if computed != expected:
-        write_atomically(golden_path(name), _method_text(computed).encode())
-        methods.golden_version.cache_clear()
-    return status, moved
+def _computed(name: str, expected: dict[str, Any] | None, is_quick: bool = False) -> dict[str, Any]:
+    """Compute the content of a golden file, for a method with the episodes of the ``expected``."""
+    if name in tracks.builtin_ids():
+        return rounded(world_golden(name, is_quick=is_quick))
+    method = golden_methods()[name]
+    golden = expected or _new_golden(name, method)
+    return golden | {"episodes": [_run_episode(episode, method) for episode in golden["episodes"]]}
+
+
+def _differences(name: str, computed: dict[str, Any], expected: dict[str, Any]) -> list[str]:
+    """Return one sentence for each number of two contents of a golden file that differs."""
+    if "method" not in expected:
+        return [f"{name}: {sentence}" for sentence in differences(computed, expected)]
+    found = []
+    for old, new in zip(expected["episodes"], computed["episodes"], strict=True):
+        known = new | {"scores": {score: new["scores"].get(score) for score in old["scores"]}}
+        found += differences(known, old, expected["tolerance"],
+                             f"{old['environment']} {old['seed']}")
+    return found
+
+
+def to_json(numbers: dict[str, Any]) -> str:
+    """Format a golden file: one line for each number."""
+    return json.dumps(numbers, indent=1) + "\n"
 
 
 def differences(computed: Any, expected: Any, tolerance: float = RTOL_FLOAT64,
@@ -209,14 +221,10 @@ def world_numbers(world: World, episodes: tuple[str, ...]) -> dict[str, Any]:
             "episodes": {name: _episode_numbers(world, name) for name in episodes}}
 
 
-def world_text(numbers: dict[str, Any]) -> str:
-    """Format a world's golden file: ten digits and one line for each number."""
-    return json.dumps(_rounded(numbers), indent=1) + "\n"
-
-
-def _rounded(value: Any) -> Any:
+def rounded(value: Any) -> Any:
+    """Return numbers and arrays, in nested dicts, as lists of numbers with ten digits."""
     if isinstance(value, dict):
-        return {name: _rounded(inner) for name, inner in value.items()}
+        return {name: rounded(inner) for name, inner in value.items()}
     if isinstance(value, str):
         return value
     return [float(f"{number:.10g}") for number in np.ravel(value)]
@@ -331,42 +339,31 @@ def _fixed_action(env: gym.Env, k: int) -> Any:
 
 
 def _new_golden(name: str, method: str) -> dict[str, Any]:
-    """Choose the episodes of a method's first golden file: the episodes of the first existing file
-    whose environments are all compatible with the method, or of the first compatible environment.
-    ``ValueError`` without one."""
-    for known in filter(None, map(read_golden, golden_methods())):
-        asked = [{key: episode[key] for key in ("environment", "kwargs", "seed")}
-                 for episode in known["episodes"]]
-        if all(_can_play(method, each["environment"], each["kwargs"]) for each in asked):
-            return {"method": name, "version": 1, "tolerance": known["tolerance"],
-                    "episodes": asked}
+    """Return a method's golden file without numbers: episodes of the first environment with which
+    it is compatible; ``ValueError`` without one."""
     for id in tracks.builtin_ids():
-        if _can_play(method, id, SHORT_KWARGS):
+        if _can_play(method, id):
             return {"method": name, "version": 1, "tolerance": RTOL_FLOAT64, "episodes": [
                 {"environment": id, "kwargs": kwargs, "seed": seed} for kwargs, seed in (
                     (SHORT_KWARGS, "dev:0"), (SHORT_KWARGS, "dev:1"), ({}, "dev:0"))]}
     raise ValueError(f"method {name} must be compatible with a built-in environment")
 
 
-def _can_play(method: str, id: str, kwargs: dict[str, Any]) -> bool:
-    asked = tracks.Environment(id, json.dumps(kwargs))
+def _can_play(method: str, id: str) -> bool:
+    asked = tracks.Environment(id, json.dumps(SHORT_KWARGS))
     if is_path(method):
         return Path(method).parents[2].name == id.replace("/", "-")
     return method in methods.builtin_methods(asked.track) and runner.is_compatible(
         load_method(method, asked.track), runner.cached_environment(asked))
 
 
-def _method_golden(golden: dict[str, Any], method: str) -> dict[str, Any]:
-    """Rerun the episodes of a method's golden file, and return it with the new numbers.
+def _run_episode(episode: dict[str, Any], method: str) -> dict[str, Any]:
+    """Rerun an episode of a method's golden file, and return it with the new numbers.
 
     ``scores`` are the finite scores except times. For an estimator, ``mean`` and ``last`` are
     entries of its mean and last estimate in mol/m³; for a policy, ``injections`` are the source and
     sink electrodes of each step. ``ValueError`` if the method is incompatible.
     """
-    return golden | {"episodes": [_run_episode(episode, method) for episode in golden["episodes"]]}
-
-
-def _run_episode(episode: dict[str, Any], method: str) -> dict[str, Any]:
     asked = tracks.Environment(episode["environment"], json.dumps(episode["kwargs"]))
     (seed,) = parse_seeds(episode["seed"])
     with threadpool_limits(1):                                  # as for records
@@ -386,22 +383,3 @@ def _answer(played: runner.EpisodeRun) -> dict[str, Any]:
     states = means[np.isfinite(means).all(axis=1)]
     nodes = np.linspace(0, means.shape[1] - 1, N_ENTRIES + 2).astype(int)[1:-1]
     return {"mean": states[:, nodes].mean(axis=0).tolist(), "last": states[-1, nodes].tolist()}
-
-
-def _method_differences(expected: dict[str, Any], computed: dict[str, Any]) -> list[str]:
-    found = []
-    for old, new in zip(expected["episodes"], computed["episodes"], strict=True):
-        known = new | {"scores": {name: new["scores"].get(name) for name in old["scores"]}}
-        found += differences(known, old, expected["tolerance"],
-                             f"{old['environment']} {old['seed']}")
-    return found
-
-
-def _method_text(golden: dict[str, Any]) -> str:
-    """Format JSON with one line for each field, so that a diff shows which number changed."""
-    episodes = [",\n".join(f'  {json.dumps(key)}: {json.dumps(value, sort_keys=True)}'
-                           for key, value in episode.items()) for episode in golden["episodes"]]
-    lines = [f" {json.dumps(key)}: {json.dumps(value)}"
-             for key, value in golden.items() if key != "episodes"]
-    body = " },\n {\n".join(f"{episode}\n" for episode in episodes)
-    return "{\n" + ",\n".join(lines) + f',\n "episodes": [\n {{\n{body} }}\n ]\n}}\n'

@@ -14,6 +14,7 @@ from eitbench.bench.tracks import builtin_ids
 from eitbench.worlds import entry
 
 from commands import eitbench
+from short import FAST
 
 IDS = builtin_ids()
 FLUIDS = list(dict.fromkeys(entry(id).world.truth_config for id in IDS))
@@ -39,7 +40,7 @@ def test_shortened_episode_agrees_with_the_golden_file(name):
 @pytest.mark.parametrize("id", [id for id in BY_FLUID if "3D" in id])
 def test_first_observations_agree_with_the_golden_file(id):
     """For worlds in three dimensions these tests take seconds only."""
-    computed = json.loads(golden.world_text(golden.first_observations(id, "train:0")))
+    computed = golden.rounded(golden.first_observations(id, "train:0"))
     assert not golden.differences(computed, golden.read_golden(id)["observations"]["train:0"])
 
 
@@ -80,7 +81,7 @@ def test_constant_off_by_a_thousandth_shows(id, part, name, shows, stays):
     """Only the numbers that depend on the constant change."""
     value = getattr(getattr(entry(id).world, part), name)
     world = entry(id).world.with_changes({part: {name: 1.001 * value}})
-    computed = json.loads(golden.world_text(golden.world_numbers(world, ("train:0",))))
+    computed = golden.rounded(golden.world_numbers(world, ("train:0",)))
     expected = golden.read_golden(id)
     expected = {"model": expected["model"], "episodes": {"train:0": expected["episodes"]["train:0"]}}
     found = {line.split(" ")[0] for line in golden.differences(computed, expected)}
@@ -93,7 +94,7 @@ def copy(tmp_path, monkeypatch):
     content = golden.read_golden(PLAIN)
     monkeypatch.setattr(golden, "WORLD_FOLDER", tmp_path)
     monkeypatch.setattr(golden, "world_golden", lambda id, is_quick: content)
-    golden.golden_path(PLAIN).write_text(golden.world_text(content))
+    golden.golden_path(PLAIN).write_text(golden.to_json(content))
     return golden.golden_path(PLAIN)
 
 
@@ -181,11 +182,12 @@ def test_numbers_within_tolerance_stay_to_the_last_bit(method_files):
     assert eitbench("golden", "homogeneous", "worst_pair")[:2] == (2, "")
 
 
-def test_a_new_method_gets_the_episodes_of_another(method_files):
-    """A new method has the episodes of the first file with compatible environments."""
-    old = method_files / "homogeneous.json"
-    content = old.read_text()
-    old.rename(method_files / "persistence.json")
+def test_a_new_method_gets_episodes(method_files, monkeypatch):
+    """A new method has two short episodes and a long one of the first compatible environment."""
+    monkeypatch.setattr(golden, "SHORT_KWARGS", {"world": FAST})
+    monkeypatch.setattr(golden, "_run_episode", lambda episode, method: episode)
+    (method_files / "homogeneous.json").unlink()
     assert eitbench("golden", "homogeneous")[:2] == (0, "homogeneous: new\n")
-    assert json.loads(old.read_text())["episodes"][0]["seed"] == json.loads(content)["episodes"][0]["seed"]
-    assert not golden.check("homogeneous")
+    new = golden.read_golden("homogeneous")
+    assert (new["version"], [(each["environment"], each["seed"]) for each in new["episodes"]]) == (
+        1, [(PLAIN, "dev:0"), (PLAIN, "dev:1"), (PLAIN, "dev:0")])
