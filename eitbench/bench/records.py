@@ -293,12 +293,12 @@ def _of_the_environment(record: dict[str, Any]) -> Iterator[str]:
     if id not in tracks.ids():                        # the record will be skipped
         return
     try:
-        boards = tracks.subtracks_of(id, kwargs)
+        board = tracks.subtrack_of_id(id, kwargs)
     except ValueError as error:
         yield f"$.environment.kwargs: {error}"
         return
-    if record["board"] not in boards:
-        yield f"$.board: must be {' or '.join(boards)}, as the environment requires"
+    if record["board"] != board:
+        yield f"$.board: must be {board}, as the environment requires"
 
 
 def _of_the_seeds(record: dict[str, Any]) -> Iterator[str]:

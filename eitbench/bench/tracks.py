@@ -6,6 +6,7 @@ import hashlib
 import json
 from collections.abc import Mapping
 from inspect import Parameter, signature
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import gymnasium as gym
@@ -161,36 +162,24 @@ def record_name(environment: str, method: str, version: str, split: str) -> str:
 def subtrack_of(env: EstimationEnv | InjectionEnv) -> str:
     """Return the subtrack of an environment, one of its track's `SUBTRACKS`."""
     lag = getattr(env, "lag", None)
-    if lag is None:
+    return "injection" if lag is None else _estimation_subtrack(lag, env.world.n_steps)
+
+
+def subtrack_of_id(id: str, kwargs: Mapping[str, Any] = MappingProxyType({})) -> str:
+    """Return the subtrack of a registered id with these arguments, without making it;
+    ``ValueError`` if an argument is invalid."""
+    for name in kwargs:
+        _check.choice(f"argument of {id}", name, _parameters(id))
+    if track_of(id) == "injection":
         return "injection"
-    if lag == 0:
-        return "filter"
-    return "smoothing" if lag == env.world.n_steps - 1 else "fixed-lag"
+    from eitbench.envs.estimation import resolve_arguments
+    changes = (kwargs.get(name) for name in ("world", "lag", "assume"))
+    world, lag, _ = resolve_arguments(entry(id), *changes)
+    return _estimation_subtrack(lag, world.n_steps)
 
 
-def subtracks_of(id: str, kwargs: dict[str, Any]) -> tuple[str, ...]:
-    """Return the possible subtracks of a registered id with these arguments, without making it: two
-    if the subtrack depends on a changed world, else one. ``ValueError`` if an argument is invalid.
-    """
-    track = track_of(id)
-    known = _parameters(id) if kwargs else ()
-    for name, value in kwargs.items():
-        _check.choice(f"argument of {id}", name, known)
-        if name in ("world", "assume") and not isinstance(value, dict | None):
-            raise ValueError(f"{name} must be an object, got {type(value).__name__}")
-    if track == "injection":
-        return SUBTRACKS[track]
-    each = entry(id)
-    lag = each.settings.get("lag", 0) if kwargs.get("lag") is None else kwargs["lag"]
-    if lag == "all":
-        return ("smoothing",)
-    if type(lag) is not int or lag < 0:
-        raise ValueError(f"lag must be 'all' or an integer of at least 0, got {lag!r}")
-    if lag == 0:
-        return ("filter",)
-    if kwargs.get("world"):                                 # its length is not computed here
-        return ("fixed-lag", "smoothing")
-    return ("smoothing",) if lag == each.world.n_steps - 1 else ("fixed-lag",)
+def _estimation_subtrack(lag: int, n_steps: int) -> str:
+    return "filter" if lag == 0 else "smoothing" if lag == n_steps - 1 else "fixed-lag"
 
 
 def category_of(id: str, board: str) -> str:

@@ -40,7 +40,7 @@ def _main(
 def list_() -> None:
     """List environments, built-in estimators and policies, with their subtracks."""
     from eitbench.bench.methods import builtin_methods, builtin_summary
-    from eitbench.bench.tracks import ids, measured_ids, subtracks_of
+    from eitbench.bench.tracks import ids, measured_ids, subtrack_of_id
     from eitbench.worlds.registry import GROUPS, entry, published_returns
     from eitbench.worlds.task import lag_steps
     lines = []
@@ -60,7 +60,7 @@ def list_() -> None:
                 about += ", returns " + ", ".join(f"{row['group']} {float(row['mean']):.3g}"
                                                   for row in returns)
             about += ", recommended to new users" * each.is_starting_point
-            lines.append((f"  {name}", subtracks_of(name, {})[0], about))
+            lines.append((f"  {name}", subtrack_of_id(name), about))
     lines.append(("environments: measured data", "", ""))
     lines += [(f"  {name}", "measured", "measurements are downloaded separately")
               for name in measured_ids()]

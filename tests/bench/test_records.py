@@ -20,7 +20,7 @@ from eitbench.bench.records import (
     with_content_hash,
     write_record,
 )
-from eitbench.bench.tracks import ALL_SUBTRACKS, environment_name, subtracks_of
+from eitbench.bench.tracks import ALL_SUBTRACKS, environment_name, subtrack_of_id
 from eitbench.worlds import entry
 
 from tiny import RUN, episode, record, sha, strict
@@ -252,35 +252,34 @@ PIPE, LATER, LONG = "eitbench/Pipe2D-v0", "eitbench/Pipe2DFixedLag-v0", "eitbenc
 TOO_LONG = entry(PIPE).world.n_steps - 1
 
 
-@pytest.mark.parametrize(("id", "kwargs", "boards"), [
+@pytest.mark.parametrize(("id", "kwargs", "board"), [
     (PIPE, {}, "filter"), (PIPE, {"lag": 0}, "filter"), (PIPE, {"lag": 3}, "fixed-lag"), (LATER, {}, "fixed-lag"),
     (PIPE, {"lag": TOO_LONG}, "smoothing"), (LONG, {}, "smoothing"), (LONG, {"lag": 0}, "filter"),
     (LONG, {"lag": None}, "smoothing"), (PIPE, {"lag": "all", "world": {"flow": {}}}, "smoothing"),
-    (PIPE, {"lag": 3, "world": {"schedule": {"scored_steps": 1}}}, "fixed-lag smoothing"),
+    (PIPE, {"lag": 2, "world": {"schedule": {"scored_steps": 9}}}, "fixed-lag"),
     ("eitbench/Pipe2DInjection-v0", {"gate": 3.0}, "injection")])
-def test_the_environment_determines_the_subtrack(id, kwargs, boards, tmp_path):
+def test_the_environment_determines_the_subtrack(id, kwargs, board, tmp_path):
     """A record with another subtrack is rejected."""
-    assert subtracks_of(id, kwargs) == tuple(boards.split())
+    assert subtrack_of_id(id, kwargs) == board
     environment = {"id": id, "name": environment_name(id, kwargs), "kwargs": kwargs}
-    for board in ALL_SUBTRACKS:
-        made = record("mine", [0.1], board=board, environment=environment)
-        if board in boards.split():
+    for other in ALL_SUBTRACKS:
+        made = record("mine", [0.1], board=other, environment=environment)
+        if other == board:
             assert read_record(write_record(tmp_path, made)) == made
         else:
-            with pytest.raises(ValueError, match=rf"\$\.board: must be {' or '.join(boards.split())}, as the env"):
-                read_record(write_unchecked(tmp_path / board, made))
+            with pytest.raises(ValueError, match=rf"\$\.board: must be {board}, as the environment"):
+                write_record(tmp_path, made)
 
 
 @pytest.mark.parametrize(("kwargs", "message"), [
-    ({"scenario": 5}, "argument of .*got 'scenario'"), ({"world": 5}, "world must be an object, got int"),
-    ({"world": [1]}, "world must be an object, got list"), ({"assume": "all"}, "assume must be an object, got str"),
-    ({"lag": -1}, "lag must be 'all' or an integer"), ({"lag": 1.5}, "lag must be"), ({"lag": True}, "lag must be"),
-    ({"lag": "some"}, "lag must be"), ({"lag": {}}, "lag must be")])
+    ({"scenario": 5}, "argument of .*got 'scenario'"), ({"world": 5}, "world"), ({"world": [1]}, "world"),
+    ({"assume": "all"}, "assume must be a dict"), ({"lag": -1}, "lag must be"), ({"lag": 1.5}, "lag must be"),
+    ({"lag": True}, "lag must be"), ({"lag": "some"}, "lag must be"), ({"lag": {}}, "lag must be")])
 def test_unknown_arguments_are_rejected(kwargs, message, tmp_path):
     """Records with such arguments are impossible."""
     environment = {"id": PIPE, "name": environment_name(PIPE, kwargs), "kwargs": kwargs}
-    with pytest.raises(ValueError, match=rf"\$\.environment\.kwargs: {message}"):
-        read_record(write_unchecked(tmp_path, record("mine", [0.1], environment=environment)))
+    with pytest.raises(ValueError, match=rf"\$\.environment\.kwargs: .*{message}"):
+        write_record(tmp_path, record("mine", [0.1], environment=environment))
 
 
 @pytest.mark.parametrize("text", ["1e999", "-1e999", "NaN", "Infinity", "9" * 400, "9" * 5000, '"\\ud800"',
