@@ -23,6 +23,7 @@ import struct
 import subprocess
 import sys
 import tempfile
+import threading
 import time
 from collections.abc import Callable, Mapping
 from contextlib import suppress
@@ -41,30 +42,29 @@ from eitbench._notice import notify
 from eitbench._sanitize import error_location, sanitize, user_traceback
 from eitbench.bench import methods
 from eitbench.bench.methods import Method, is_builtin, is_path, load_method, method_sha256
-from eitbench.bench.tracks import SUBTRACKS, Environment, is_measured
+from eitbench.bench.tracks import Environment, is_measured
 from eitbench.data.cache import CACHE_VARIABLE, cache_folder, model_key
 from eitbench.worlds.random_streams import generator_from_state
 from eitbench.worlds.registry import import_entries, runtime_entries
+from eitbench.worlds.task import Estimate
 
 ISOLATE = ("auto", "none", "process", "bubblewrap")
 """Values of the option ``isolate``."""
 REPLY_TIMEOUT_S = 600.0
-EPISODE_TIMEOUT_S = 6 * 3600.0
 CHECK_INTERVAL_S = 0.2
 """time between two checks of a worker's memory and number of threads"""
 MAX_HEADER_BYTES = 1 << 20
 MAX_ARRAY_BYTES = 1 << 28
 MAX_OUTPUT_CHARS = 10_000
-"""limit of the printed text that is shown for one episode"""
+"""limit of the printed text that is shown for one reply"""
 MAX_TEXT_CHARS = 2000
 METHOD_NAME = re.compile(r"[^./\\][^/\\]{0,99}")
+TITLE = re.compile(f".{{1,{methods.MAX_TITLE_CHARS}}}")
 NUMERIC_ENV = ("OPENBLAS_", "MKL_", "OMP_", "NPY_", "NUMBA_CPU")
 """Prefixes of environment variables that change the last bits of results."""
 ETC = ("alternatives", "group", "ld.so.cache", "localtime", "nsswitch.conf", "passwd")
 _NUMERIC_DTYPE = re.compile(r"[<>|][biuf][1248]")
 _ENTRY_POINTS = ("eitbench.worlds", "eitbench.methods", "eitbench.scores", "eitbench.loaders")
-
-Arrays = Mapping[str, np.ndarray]
 
 
 class WorkerError(RuntimeError):
@@ -277,32 +277,16 @@ def _load(track: str, id: str, kwargs: str, method: str, isolation: str, path: P
         raise ValueError(f"{path} cannot be loaded: {str(error).removeprefix('ValueError: ')}"
                          ) from None
     about = worker.about
-    if path.suffix == ".py":
-        about["name"] = path.stem  # a worker may report any name
-    _check_about(path, about, track)
-    built_in = methods.builtin_files(id).get(about["name"])
+    name = path.stem if path.suffix == ".py" else about.get("name")  # a worker may report any name
+    for key, value, limit in (("name", name, METHOD_NAME), ("title", about.get("title"), TITLE)):
+        if not isinstance(value, str) or not limit.fullmatch(value) or sanitize(value) != value:
+            raise ValueError(f"{path} reports an invalid {key}")
+    built_in = methods.builtin_files(id).get(name)
     if built_in is not None and methods.builtin_sha256(built_in) != worker.sha256:
-        raise ValueError(f"{path} has the name of a built-in method, {about['name']}, under which "
+        raise ValueError(f"{path} has the name of a built-in method, {name}, under which "
                          "results are stored; rename it")
-    return Method(track, about["name"], about["title"], path, worker.sha256,
-                  tuple(about["subtracks"]), about["parameters"], worker, about["role"],
-                  bool(about.get("privileged")))
-
-
-def _check_about(path: Path, about: dict[str, Any], track: str) -> None:
-    """Raise ``ValueError`` if a worker reports attributes that no method can have."""
-    name, title, subtracks, role = (about.get(key)
-                                    for key in ("name", "title", "subtracks", "role"))
-    valid = {
-        "name": isinstance(name, str) and METHOD_NAME.fullmatch(name) and sanitize(name) == name,
-        "title": (isinstance(title, str) and 0 < len(title) <= methods.MAX_TITLE_CHARS
-                  and sanitize(title) == title),
-        "role": role is None or role in methods.ROLES,
-        "subtracks": isinstance(subtracks, list) and subtracks and all(
-            each in SUBTRACKS[track] for each in subtracks)}
-    if wrong := [key for key, is_valid in valid.items() if not is_valid]:
-        raise ValueError(f"{path} reports an invalid {', '.join(wrong)}")
-    _check.json_object(f"{path}: parameters", about.get("parameters"), methods.MAX_PARAMETERS_BYTES)
+    return methods.checked_method(track, name, str(path), worker, about)._replace(
+        title=about["title"], path=path, sha256=worker.sha256)
 
 
 class Worker:
@@ -326,12 +310,15 @@ class Worker:
         self._name = sanitize(Path(method).stem)
         self._limits = limits or Limits()
         self._is_confined = isolation == "bubblewrap"
-        self._next_check = 0.0
+        self._deadline = math.inf
         self._process: Any = None
         self._request = {"track": track, "id": id, "kwargs": kwargs, **self._files(id, method)}
 
     def start(self) -> None:
-        """End the process of the current worker, and start one that loads the method."""
+        """Unless the process runs, start one that loads the method, in place of the process of the
+        current worker."""
+        if self.is_alive:
+            return
         close()
         command = [sys.executable, "-P", "-c", f"from {__name__} import main; main()",
                    json.dumps(self._limits)]
@@ -344,46 +331,34 @@ class Worker:
             command = [*bubblewrap(self._limits, files), *command]
         self._folder = tempfile.TemporaryDirectory(prefix="eitbench-", ignore_cleanup_errors=True)
         self._home = Path("/tmp" if self._is_confined else self._folder.name)
-        self._socket, theirs = socket.socketpair()
-        self._socket.settimeout(CHECK_INTERVAL_S)
-        with theirs:
+        ours, theirs = socket.socketpair()
+        with ours, theirs:
+            self._stream = ours.makefile("rwb")
             self._process = subprocess.Popen(
                 command, stdin=theirs.fileno(), stdout=theirs.fileno(), stderr=subprocess.DEVNULL,
                 start_new_session=True, env=self._environment(), cwd=Path.cwd())
         _started.append(self)
-        self._left_s, self._left_chars = EPISODE_TIMEOUT_S, MAX_OUTPUT_CHARS
+        self._exceeded = ""
+        threading.Thread(target=self._watch, args=(self._process,), daemon=True).start()
         try:
             self.about = self._ask("load", **self._request)[0]
         except BaseException:
             self.close()
             raise
 
-    def ensure_started(self) -> None:
-        """Start the process unless it runs."""
-        if not self.is_alive:
-            self.start()
-
     def __call__(self, task: Any, random: np.random.Generator | None = None) -> Worker:
         """Begin an episode with a new instance of the method, like its class; a policy draws from a
         generator with the state of ``random``."""
-        self.ensure_started()
-        self._left_s, self._left_chars = EPISODE_TIMEOUT_S, MAX_OUTPUT_CHARS
+        self.start()
         self._ask("begin", random=None if random is None else random.bit_generator.state)
         return self
 
     def update(self, voltages: np.ndarray, currents: np.ndarray) -> Any:
         """Return the estimator's `Estimate`, or None, after a measurement."""
-        from eitbench.worlds.task import Estimate
-        values, arrays = self._ask("update", voltages=voltages, currents=currents)
-        kind = values.get("estimate")
-        if kind is None:
-            return None
-        if kind != "Estimate" or not {"mean"} <= set(arrays) <= set(Estimate._fields):
-            raise WorkerError("ValueError: Estimator.update must return an Estimate or None, got "
-                              f"{str(kind)[:MAX_TEXT_CHARS]}")
-        return Estimate(**arrays)
+        arrays = self._ask("update", voltages=voltages, currents=currents)[1]
+        return Estimate(**arrays) if arrays else None
 
-    def act(self, observation: Arrays) -> Any:
+    def act(self, observation: Mapping[str, np.ndarray]) -> Any:
         """Return the policy's action."""
         action = self._ask("act", **observation)[1].get("action", np.zeros(0))
         return int(action) if action.shape == () and action.dtype.kind in "iu" else action
@@ -401,8 +376,9 @@ class Worker:
     def close(self) -> None:
         """End the process and its children, and remove its folder."""
         if self._process is not None:
-            self._kill()
-            self._socket.close()
+            _kill(self._process)
+            with suppress(OSError):  # data that it has not read
+                self._stream.close()
             self._folder.cleanup()
 
     def _environment(self) -> dict[str, str]:
@@ -436,29 +412,27 @@ class Worker:
     def _ask(self, do: str, **content: Any) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
         """Send a request with the arguments of one of the methods of `_MethodServer`, and return
         the values and arrays of the reply."""
-        begin = time.monotonic()
-        self._deadline = begin + self.reply_timeout
+        self._deadline = time.monotonic() + self.reply_timeout
         try:
-            self._send(encode_message({"do": do, **content}))
-            reply, arrays = decode_message(self._read)
-            self._left_s -= time.monotonic() - begin
-            if self._left_s < 0.0:
-                raise WorkerError("TimeoutError: its replies in one episode took more than "
-                                  f"{EPISODE_TIMEOUT_S:g} s")
-        except ConnectionError:
+            self._stream.write(encode_message({"do": do, **content}))
+            self._stream.flush()
+            reply, arrays = decode_message(partial(_read_exactly, self._stream))
+        except (EOFError, ConnectionError):
             with suppress(subprocess.TimeoutExpired):
                 self._process.wait(1.0)
-            self._kill()
-            raise WorkerError("ChildProcessError: the worker ended with status "
+            _kill(self._process)
+            raise WorkerError(self._exceeded or "ChildProcessError: the worker ended with status "
                               f"{self._process.returncode}, as after a crash or at a memory limit"
                               ) from None
         except ValueError as error:
-            self._kill()
+            _kill(self._process)
             raise WorkerError(f"ValueError: {error}") from None
         except BaseException:  # a later reply would belong to this request
-            self._kill()
+            _kill(self._process)
             raise
-        self._show(str(reply.pop("printed", ""))[:MAX_OUTPUT_CHARS])
+        finally:
+            self._deadline = math.inf
+        self._show(str(reply.pop("printed", ""))[:MAX_OUTPUT_CHARS].rstrip("\n"))
         if "error" in reply:
             message, where, traceback = (str(reply.get(name))[:MAX_TEXT_CHARS]
                                          for name in ("error", "where", "traceback"))
@@ -469,48 +443,30 @@ class Worker:
 
     def _show(self, printed: str) -> None:
         """Print the method's output, each line prefixed with its name."""
-        if printed := printed[:self._left_chars].rstrip("\n"):
+        if printed:
             lines = sanitize(printed, lines=True).replace("\n", f"\n[{self._name}] ")
             sys.stderr.write(f"[{self._name}] {lines}\n")
-        self._left_chars -= len(printed)
 
-    def _send(self, message: bytes) -> None:
-        left = memoryview(message)
-        while left:  # the buffer stays full if the worker does not read
-            self._check_limits()
-            with suppress(TimeoutError):
-                left = left[self._socket.send(left):]
-
-    def _read(self, n: int) -> bytes:
-        parts = bytearray()
-        while len(parts) < n:
-            self._check_limits()
-            with suppress(TimeoutError):
-                part = self._socket.recv(min(n - len(parts), 1 << 20))
-                if not part:
-                    raise ConnectionError
-                parts += part
-        return bytes(parts)
-
-    def _check_limits(self) -> None:
-        """Raise `WorkerError` after the deadline and, each `CHECK_INTERVAL_S`, if the processes
-        have too much memory or too many threads."""
-        now = time.monotonic()
-        if now > self._deadline:
-            raise WorkerError(f"TimeoutError: no reply within {self.reply_timeout:g} s")
-        if now <= self._next_check:
-            return
-        family = self._family()
-        if sum(_status(pid, "Threads") for pid in family) > self._limits.threads:
-            raise WorkerError(f"ResourceLimitError: it started more than {self._limits.threads} "
-                              "processes and threads")
-        # VmRSS counts a shared page once for each process, Pss once in total.
-        if sum(_status(pid, "VmRSS") for pid in family) > self._limits.memory and sum(
-                _status(pid, "Pss", "smaps_rollup") or _status(pid, "VmRSS")
-                for pid in family) > self._limits.memory:
-            raise WorkerError("ResourceLimitError: it held more than "
-                              f"{self._limits.memory >> 20} MiB")
-        self._next_check = time.monotonic() + CHECK_INTERVAL_S
+    def _watch(self, process: subprocess.Popen[bytes]) -> None:
+        """Kill the process after the deadline of a reply, or when it and its children have too much
+        memory or too many threads."""
+        limits = self._limits
+        while process.poll() is None:
+            family = self._family()
+            if time.monotonic() > self._deadline:
+                self._exceeded = f"TimeoutError: no reply within {self.reply_timeout:g} s"
+            elif sum(_status(pid, "Threads") for pid in family) > limits.threads:
+                self._exceeded = (f"ResourceLimitError: it started more than {limits.threads} "
+                                  "processes and threads")
+            # VmRSS counts a shared page once for each process, Pss, which takes longer, in total
+            elif sum(_status(pid, "VmRSS") for pid in family) > limits.memory and sum(
+                    _status(pid, "Pss", "smaps_rollup") or _status(pid, "VmRSS")
+                    for pid in family) > limits.memory:
+                self._exceeded = f"ResourceLimitError: it held more than {limits.memory >> 20} MiB"
+            else:
+                time.sleep(CHECK_INTERVAL_S)
+                continue
+            _kill(process)
 
     def _family(self) -> list[int]:
         """Return the ids of the process and its descendants; stop soon after the limit is
@@ -526,11 +482,12 @@ class Worker:
                     left += map(int, children.split())
         return found
 
-    def _kill(self) -> None:
-        """Kill the process and its children; under bubblewrap the kernel ends all processes."""
-        with suppress(ProcessLookupError, PermissionError):
-            os.killpg(self._process.pid, signal.SIGKILL)
-        self._process.wait()
+
+def _kill(process: subprocess.Popen[bytes]) -> None:
+    """Kill a process and its children; under bubblewrap the kernel ends all processes."""
+    with suppress(ProcessLookupError, PermissionError):
+        os.killpg(process.pid, signal.SIGKILL)
+    process.wait()
 
 
 def _status(pid: int, field: str, file: str = "status") -> int:
@@ -639,10 +596,13 @@ class _MethodServer:
     def update(self, voltages: np.ndarray, currents: np.ndarray) -> dict[str, Any]:
         """Return the estimator's estimate after a measurement."""
         estimate = self._instance.update(voltages, currents)
-        if not hasattr(estimate, "_asdict"):
-            return {"estimate": None if estimate is None else type(estimate).__name__}
-        return {"estimate": "Estimate"} | {name: np.asarray(value) for name, value
-                                           in estimate._asdict().items() if value is not None}
+        if estimate is None:
+            return {}
+        if not isinstance(estimate, Estimate):
+            raise ValueError("Estimator.update must return an Estimate or None, got "
+                             f"{type(estimate).__name__}")
+        return {name: np.asarray(value) for name, value in estimate._asdict().items()
+                if value is not None}
 
     def act(self, **observation: np.ndarray) -> dict[str, Any]:
         """Return the policy's action."""

@@ -329,21 +329,34 @@ def method_from_class(method: type[Any], track: str, name: str, where: str = "")
     who = f"{form.kind} {where or name}: {method.__name__}"
     if not callable(getattr(method, form.interface.partition("(")[0], None)):
         raise ValueError(f"{who} must have a method {form.interface}")
-    # `boards` is the name of this attribute in older files
-    named = getattr(method, "subtracks", getattr(method, "boards", SUBTRACKS[track][:1]))
-    if not (subtracks := tuple(named)) or not set(subtracks) <= set(SUBTRACKS[track]):
+    given = {key: getattr(method, key) for key in ("role", "privileged", "parameters", "subtracks")
+             if hasattr(method, key)}
+    if hasattr(method, "boards"):           # name of `subtracks` in older files
+        given.setdefault("subtracks", method.boards)
+    return checked_method(track, name, who, method, given)
+
+
+def checked_method(track: str, name: str, who: str, make: Callable[..., Any],
+                   given: Mapping[str, Any]) -> Method:
+    """Return a method with the ``given`` attributes of its class, without a file. ``ValueError``,
+    naming ``who`` has them, if they are invalid."""
+    subtracks = given.get("subtracks", SUBTRACKS[track][:1])
+    if (not subtracks or not isinstance(subtracks, list | tuple)
+            or any(each not in SUBTRACKS[track] for each in subtracks)):
         raise ValueError(f"{who}.subtracks must be some of {', '.join(SUBTRACKS[track])}, got "
                          f"{subtracks!r}")
-    role = getattr(method, "role", None)
+    role = given.get("role")
     if role not in ROLES:
         raise ValueError(f"{who}.role must be among {', '.join(map(repr, ROLES))}; got {role!r}")
-    privileged = getattr(method, "privileged", False)
+    privileged = given.get("privileged", False)
     if not isinstance(privileged, bool):
         raise ValueError(f"{who}.privileged must be True or False, got {privileged!r}")
-    given = getattr(method, "parameters", {})
-    parameters = dict(given) if isinstance(given, Mapping) else given
+    parameters = given.get("parameters", {})
+    if isinstance(parameters, Mapping):
+        parameters = dict(parameters)
     _check.json_object(f"{who}.parameters", parameters, MAX_PARAMETERS_BYTES)
-    return Method(track, name, name, Path(), "", subtracks, parameters, method, role, privileged)
+    return Method(track, name, name, Path(), "", tuple(subtracks), parameters, make, role,
+                  privileged)
 
 
 def load_module(kind: str, path: Path, source: bytes) -> ModuleType:

@@ -82,7 +82,7 @@ def run_method(asked: Environment, method: Method, seed: int) -> EpisodeRun:
     check_track(asked.id, method.track)
     env = cached_environment(asked)
     if isinstance(method.make, Worker):
-        method.make.ensure_started()                # before computing time is measured
+        method.make.start()                         # before computing time is measured
     if isinstance(env, InjectionEnv):
         return _run_policy(env, method, seed)
     if is_measured(asked.id):
