@@ -31,7 +31,7 @@ REFERENCE = {
                         "eitbench.worlds.instrument", "eitbench.worlds.schedule",
                         "eitbench.worlds.world"],
     "eitbench.scoring": ["eitbench.scoring", "eitbench.bench.scores"],
-    "eitbench.bench": ["eitbench.bench", "eitbench.bench.statistics", "eitbench.bench.ranking"],
+    "eitbench.bench": ["eitbench.bench", "eitbench.bench.statistics"],
     "eitbench.rl": ["eitbench.rl.training", "eitbench.rl.agents", "eitbench.rl.vec_env",
                     "eitbench.rl.networks"],
 }

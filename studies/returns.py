@@ -12,8 +12,8 @@ import pandas as pd
 import eitbench
 from eitbench._files import PACKAGE
 from eitbench.bench.methods import builtin_agents, builtin_methods, load_method
-from eitbench.bench.ranking import agent_name
 from eitbench.bench.runner import cached_environment, is_compatible
+from eitbench.bench.statistics import agent_name
 from eitbench.bench.text import mean_and_interval
 from eitbench.bench.tracks import Environment, builtin_ids, track_of
 from eitbench.report.policies import OPEN_LOOP

@@ -1,4 +1,4 @@
-"""Statistics of a leaderboard: interquartile mean, bootstrap intervals, paired comparisons.
+"""Statistics of a leaderboard: interquartile mean, bootstrap intervals, paired comparisons, ranks.
 
 Methods run on the same episodes, identified by their seeds, in several environments. Environments
 are strata: episodes are resampled within each environment. Intervals are 95 % percentile bootstrap
@@ -6,9 +6,9 @@ intervals (Efron & Tibshirani, *An introduction to the bootstrap*, 1993, ch. 13)
 Agarwal et al., "Deep reinforcement learning at the edge of the statistical precipice" (NeurIPS
 2021), and expanded with Student's t, as plain ones are too narrow for few episodes (Hesterberg,
 "What teachers should know about the bootstrap", The American Statistician 69, 2015, section 5.3).
-Scores are sorted, by value or by seed, before they are resampled, and ``seed`` fixes the random
-stream: intervals do not depend on the process or on the order of the scores. `docs/statistics.md`
-defines the numbers.
+Scores are sorted, by value or by seed, before they are resampled, and the random stream is fixed:
+intervals do not depend on the process or on the order of the scores. `docs/statistics.md` defines
+the numbers.
 
 `scipy.stats.bootstrap` has no strata and resamples for each statistic, which takes minutes for a
 leaderboard; here all methods of a leaderboard share one set of resamples.
@@ -17,6 +17,7 @@ leaderboard; here all methods of a leaderboard share one set of resamples.
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Callable, Mapping, Sequence
 from functools import lru_cache
 from typing import Any
@@ -53,25 +54,19 @@ def interquartile_mean(*scores: ArrayLike) -> Any:
     -------
     (...) array; a number for arrays (n_e,).
     """
-    strata = [np.asarray(stratum, dtype=float) for stratum in scores]
-    if not (total := sum(stratum.shape[-1] for stratum in strata)):
-        raise ValueError("scores must hold at least one score")
     # equals scipy.stats.trim_mean(…, 0.25), but does not depend on the order to the last bit
-    ordered = np.sort(np.concatenate(strata, axis=-1), axis=-1)
-    return ordered[..., total // 4:total - total // 4].mean(axis=-1)
+    ordered = np.sort(np.concatenate([np.asarray(each, float) for each in scores], axis=-1))
+    cut = ordered.shape[-1] // 4
+    return ordered[..., cut:ordered.shape[-1] - cut].mean(axis=-1)
 
 
 def mean_over_environments(*scores: ArrayLike) -> Any:
     """Average the means of the environments, (...) from (..., n_e) each, with equal weights."""
-    if not scores or not all(np.shape(stratum)[-1] for stratum in scores):
-        raise ValueError("scores must hold at least one score of each environment")
-    means = [np.mean(np.asarray(stratum, dtype=float), axis=-1) for stratum in scores]
-    return np.mean(means, axis=0)
+    return np.mean([np.mean(np.asarray(each, float), axis=-1) for each in scores], axis=0)
 
 
 def stratified_bootstrap(scores_by_stratum: Mapping[str, ArrayLike], statistic: Statistic, *,
-                         n_resamples: int = N_RESAMPLES, seed: int = 0,
-                         ) -> tuple[float, float, float]:
+                         n_resamples: int = N_RESAMPLES) -> tuple[float, float, float]:
     """Compute a statistic and its 95 % bootstrap interval, resampling episodes within each
     environment.
 
@@ -83,8 +78,6 @@ def stratified_bootstrap(scores_by_stratum: Mapping[str, ArrayLike], statistic: 
         Called with one array for each environment, in the order of their names: (n_e,) for the
         value, and once for all resamples with (n_resamples, n_e). It must not depend on the order
         of episodes; e.g. `interquartile_mean` and `mean_over_environments`.
-    n_resamples, seed : int
-        Number of resamples, and the seed of their random stream.
 
     Returns
     -------
@@ -94,44 +87,25 @@ def stratified_bootstrap(scores_by_stratum: Mapping[str, ArrayLike], statistic: 
     """
     strata = [np.sort(np.asarray(scores_by_stratum[environment], dtype=float), axis=-1)
               for environment in sorted(scores_by_stratum)]
-    _check_strata("scores_by_stratum", strata)
-    value = float(statistic(*strata))
-    if not has_enough_episodes(strata):
-        return value, -math.inf, math.inf
-    low, high = _interval(resample(strata, statistic, n_resamples, seed), strata)
-    return value, low, high
+    _check_strata(strata)
+    return float(statistic(*strata)), *_interval(strata, _resample(strata, statistic, n_resamples))
 
 
 def paired_difference(a: Scores, b: Scores, *, statistic: Statistic = mean_over_environments,
-                      n_resamples: int = N_RESAMPLES, seed: int = 0) -> tuple[float, float, float]:
+                      n_resamples: int = N_RESAMPLES) -> tuple[float, float, float]:
     """Compute statistic(a) − statistic(b) on the episodes that both have, with its 95 % interval;
     negative if a is lower.
 
     Every resample has the same episodes for both, so the difficulty of an episode cancels, and far
     smaller differences are significant than in a comparison of two intervals. The default is the
     mean difference; for several environments the mean of their means. Exchanging a and b changes
-    the sign exactly.
-
-    Parameters
-    ----------
-    a, b : environment -> seed -> score
-        Seeds that only one of them has are ignored.
-    statistic, n_resamples, seed
-        As in `stratified_bootstrap`, like the three returned numbers.
-
-    Raises
-    ------
-    ValueError
-        If the environments differ, or a and b share no seed in one of them.
+    the sign exactly. Seeds that only one of them has are ignored. Statistic and returned numbers as
+    in `stratified_bootstrap`; ``ValueError`` if the environments differ, or a and b share no seed
+    in one of them.
     """
     ours, theirs = _shared(a, b)
-    value = float(statistic(*ours) - statistic(*theirs))
-    if not has_enough_episodes(ours):
-        return value, -math.inf, math.inf
-    differences = (resample(ours, statistic, n_resamples, seed)
-                   - resample(theirs, statistic, n_resamples, seed))
-    low, high = _interval(differences, ours)
-    return value, low, high
+    drawn = [_resample(each, statistic, n_resamples) for each in (ours, theirs)]
+    return float(statistic(*ours) - statistic(*theirs)), *_interval(ours, drawn[0] - drawn[1])
 
 
 def paired_probability_of_improvement(a: Scores, b: Scores, *, higher_is_better: bool = False,
@@ -139,7 +113,7 @@ def paired_probability_of_improvement(a: Scores, b: Scores, *, higher_is_better:
     """Compute the fraction of the shared episodes in which a is better than b, with its 95 %
     interval; an equal score counts ½.
 
-    The value is the mean of the environments' fractions. Arguments, pairing and errors as in
+    The value is the mean of the environments' fractions. Pairing and errors as in
     `paired_difference`; with too few episodes the interval is [0, 1].
     """
     sign = 1.0 if higher_is_better else -1.0
@@ -149,24 +123,62 @@ def paired_probability_of_improvement(a: Scores, b: Scores, *, higher_is_better:
     return value, max(low, 0.0), min(high, 1.0)
 
 
-def resample(strata: Sequence[np.ndarray], statistic: Statistic, n_resamples: int,
-             seed: int) -> np.ndarray:
+def shared_ranks(scores: Mapping[str, Scores], *,
+                 statistic: Statistic = mean_over_environments, higher_is_better: bool = False,
+                 n_resamples: int = N_RESAMPLES) -> dict[str, int]:
+    """Rank methods that ran on the same episodes: 1 + the number of methods that are significantly
+    better. Return method -> rank, in the order of the statistic, the best first.
+
+    A method is significantly better if the interval of the `paired_difference` excludes zero on the
+    better side. Rank 1 means that no method is significantly better, rank 3 that two are. With too
+    few episodes for an interval (`has_enough_episodes`), all ranks are 1.
+
+    The order by rank may differ from the order by the statistic. Each comparison is at 95 %,
+    without correction for the number of comparisons (``docs/statistics.md``). ``ValueError`` if the
+    methods did not run on the same episodes, or a score is not finite.
+    """
+    if not scores:
+        return {}
+    sign = -1.0 if higher_is_better else 1.0
+    strata = dict(zip(scores, _shared(*scores.values()), strict=True))
+    first = next(iter(strata.values()))
+    for method, own in scores.items():
+        if sum(map(len, own.values())) != sum(map(len, first)):
+            raise ValueError(f"scores of all methods must be of the same episodes, got others of "
+                             f"{method}")
+    values = {method: sign * float(statistic(*map(np.sort, own))) for method, own in strata.items()}
+    order = sorted(scores, key=lambda method: (values[method], method))
+    if not has_enough_episodes(first):
+        return dict.fromkeys(order, 1)
+    cut = tail_percent(tuple(map(len, first)))
+    # all methods have the same resamples, so the difference of two rows is paired
+    drawn = {method: sign * _resample(strata[method], statistic, n_resamples) for method in order}
+    return {method: 1 + sum(bool(np.percentile(drawn[method] - drawn[other], cut) > 0.0)
+                            for other in order) for method in order}
+
+
+def agent_name(method: str) -> str:
+    """Return the name of an agent without its training seed: ppo_seed4 -> ppo."""
+    return re.sub(r"_seed\d+$", "", method)
+
+
+def mean_by_seed(scores: Sequence[Mapping[str, float]]) -> dict[str, float]:
+    """Return episode seed -> mean over an agent's training seeds, if all of them have a score."""
+    return {seed: float(np.mean([own[seed] for own in scores])) for seed in scores[0]
+            if all(seed in own for own in scores)}
+
+
+def _resample(strata: Sequence[np.ndarray], statistic: Statistic, n_resamples: int) -> np.ndarray:
     """Compute a statistic (n_resamples,) of resamples of the strata (n_e,)."""
-    if n_resamples < 1:
-        raise ValueError(f"n_resamples must be at least 1, got {n_resamples}")
-    positions = _positions(tuple(map(len, strata)), n_resamples, seed)
-    values = np.asarray(statistic(*(stratum[drawn] for stratum, drawn
-                                    in zip(strata, positions, strict=True))))
-    if values.shape != (n_resamples,):  # e.g. np.mean would also average over the resamples
-        raise ValueError("statistic must reduce the last axis only: expected shape "
-                         f"{(n_resamples,)}, got {values.shape}")
-    return values
+    positions = _positions(tuple(map(len, strata)), n_resamples)
+    return np.asarray(statistic(*(stratum[drawn] for stratum, drawn
+                                  in zip(strata, positions, strict=True))))
 
 
 @lru_cache(maxsize=4)
-def _positions(sizes: tuple[int, ...], n_resamples: int, seed: int) -> tuple[np.ndarray, ...]:
+def _positions(sizes: tuple[int, ...], n_resamples: int) -> tuple[np.ndarray, ...]:
     """Draw the episodes of each resample: (n_resamples, n_e) for each stratum of n_e episodes."""
-    random = np.random.default_rng(seed)
+    random = np.random.default_rng(0)
     positions = tuple(random.integers(n, size=(n_resamples, n)) for n in sizes)
     for each in positions:
         each.setflags(write=False)
@@ -187,8 +199,10 @@ def tail_percent(sizes: tuple[int, ...]) -> float:
     return float(100.0 * norm.cdf(-student.ppf(0.975, freedom) * math.sqrt(n / freedom)))
 
 
-def _interval(values: np.ndarray, strata: Sequence[np.ndarray]) -> tuple[float, float]:
+def _interval(strata: Sequence[np.ndarray], values: np.ndarray) -> tuple[float, float]:
     """Compute the ends of the interval from resampled values (n_resamples,) of the strata."""
+    if not has_enough_episodes(strata):
+        return -math.inf, math.inf
     cut = tail_percent(tuple(map(len, strata)))
     # one interpolation for both ends, so that the ends for −values are the exact negatives
     below, above = (np.percentile(side, cut) for side in (values, -values))
@@ -201,25 +215,23 @@ def has_enough_episodes(strata: Sequence[np.ndarray]) -> bool:
     return min(sizes) >= 2 and sum(sizes) >= MIN_EPISODES
 
 
-def _check_strata(name: str, strata: Sequence[np.ndarray]) -> None:
+def _check_strata(strata: Sequence[np.ndarray]) -> None:
     if not strata or not all(stratum.ndim == 1 and stratum.size and np.isfinite(stratum).all()
                              for stratum in strata):
-        raise ValueError(f"{name} must hold finite scores (n_e,) of at least one episode for each "
-                         "of its environments")
+        raise ValueError("scores must be finite numbers (n_e,) of at least one episode, which "
+                         "compared methods share, in each environment")
 
 
-def _shared(a: Scores, b: Scores) -> tuple[list[np.ndarray], list[np.ndarray]]:
-    """Return the scores (n_e,) of a and of b in each environment on their shared seeds, by name."""
-    if set(a) != set(b):
-        raise ValueError("environments must be the same for both, got "
-                         f"{', '.join(a)} and {', '.join(b)}")
-    seeds = {environment: sorted(a[environment].keys() & b[environment].keys())
-             for environment in sorted(a)}
-    for environment, shared in seeds.items():
-        if not shared:
-            raise ValueError("a and b must share a seed in every environment, got none in "
-                             f"{environment}")
-    ours, theirs = ([np.array([side[environment][seed] for seed in shared], dtype=float)
-                     for environment, shared in seeds.items()] for side in (a, b))
-    _check_strata("a and b", [*ours, *theirs])
-    return ours, theirs
+def _shared(*scores: Scores) -> list[list[np.ndarray]]:
+    """Return the scores (n_e,) of each method in each environment, sorted by name, on the seeds
+    that all methods share."""
+    names = sorted(scores[0])
+    if any(set(own) != set(names) for own in scores):
+        raise ValueError("environments must be the same for all methods, got "
+                         f"{' and '.join(sorted({', '.join(sorted(own)) for own in scores}))}")
+    seeds = {name: sorted(set.intersection(*(set(own[name]) for own in scores))) for name in names}
+    strata = [[np.array([own[name][seed] for seed in seeds[name]], dtype=float) for name in names]
+              for own in scores]
+    for own in strata:
+        _check_strata(own)
+    return strata

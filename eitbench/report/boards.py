@@ -19,7 +19,6 @@ import pandas as pd
 from eitbench._files import bundled_path
 from eitbench.bench import tracks
 from eitbench.bench.episode_table import read_episode_table, table_path
-from eitbench.bench.ranking import agent_name, mean_by_seed, shared_ranks
 from eitbench.bench.records import (
     finished_at,
     read_valid_files,
@@ -30,8 +29,11 @@ from eitbench.bench.records import (
 from eitbench.bench.scores import scores
 from eitbench.bench.statistics import (
     Scores,
+    agent_name,
     interquartile_mean,
+    mean_by_seed,
     mean_over_environments,
+    shared_ranks,
     stratified_bootstrap,
 )
 from eitbench.bench.text import scores_by_seed, seed_ranges

@@ -11,7 +11,6 @@ import pandas as pd
 
 from eitbench import _check
 from eitbench._files import bundled_path, resolve_input
-from eitbench.bench.ranking import agent_name, mean_by_seed
 from eitbench.bench.records import (
     finished_at,
     read_record,
@@ -22,7 +21,9 @@ from eitbench.bench.records import (
 from eitbench.bench.scores import Score, scores
 from eitbench.bench.statistics import (
     Statistic,
+    agent_name,
     interquartile_mean,
+    mean_by_seed,
     mean_over_environments,
     paired_difference,
     paired_probability_of_improvement,

@@ -11,10 +11,9 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from eitbench.bench.ranking import agent_name
 from eitbench.bench.run import Job, successful_results
 from eitbench.bench.scores import scores
-from eitbench.bench.statistics import MIN_EPISODES, stratified_bootstrap
+from eitbench.bench.statistics import MIN_EPISODES, agent_name, stratified_bootstrap
 
 OPEN_LOOP = ("adjacent", "opposite", "transverse", "best_pair", "best_cycle", "best_currents",
              "schedule")

@@ -15,7 +15,7 @@ import pandas as pd
 from markupsafe import Markup
 
 from eitbench._sanitize import escape_markdown
-from eitbench.bench.ranking import agent_name, mean_by_seed
+from eitbench.bench.statistics import agent_name, mean_by_seed
 from eitbench.bench.table import MISSING, Cell, Table, mean_cell, number_cell
 from eitbench.bench.table import Row as TableRow
 from eitbench.bench.text import format_interval, format_number, scores_by_seed

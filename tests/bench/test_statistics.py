@@ -4,12 +4,12 @@ import math
 
 import numpy as np
 import pytest
-from eitbench.bench.ranking import shared_ranks
 from eitbench.bench.statistics import (
     interquartile_mean,
     mean_over_environments,
     paired_difference,
     paired_probability_of_improvement,
+    shared_ranks,
     stratified_bootstrap,
     tail_percent,
 )
@@ -64,19 +64,15 @@ def test_interquartile_mean_pools_and_the_mean_does_not():
 
 
 @pytest.mark.parametrize(("n", "statistic", "expected"), [
-    (6, mean_over_environments, 0.932), (10, mean_over_environments, 0.944), (30, mean_over_environments, 0.950),
-    (6, interquartile_mean, 0.955), (10, interquartile_mean, 0.972), (30, interquartile_mean, 0.959)])
+    (6, mean_over_environments, 0.932), (10, interquartile_mean, 0.972)])
 def test_coverage(n, statistic, expected):
-    """The coverage of 1000 intervals for n normal numbers agrees with 6000 other data sets to 3 standard errors.
-
-    Without the expansion by Student's t it is too small: 0.854, 0.902 and 0.938 for the mean, 0.904, 0.937 and 0.948.
-    """
-    repeats, random = 1000, np.random.default_rng(11)
-    held = 0
-    for _ in range(repeats):
+    """The coverage of 1000 intervals for n normal numbers agrees with 6000 other data sets to 3 standard errors. Without
+    the expansion by Student's t it is too small, 0.854 and 0.937."""
+    random, held = np.random.default_rng(11), 0
+    for _ in range(1000):
         _, low, high = stratified_bootstrap({"pipe": random.normal(3.0, 2.0, n)}, statistic, n_resamples=1000)
         held += low <= 3.0 <= high
-    assert held / repeats == pytest.approx(expected, abs=3 * math.sqrt(expected * (1 - expected) / repeats))
+    assert held / 1000 == pytest.approx(expected, abs=3 * math.sqrt(expected * (1 - expected) / 1000))
 
 
 def test_coverage_over_environments():
@@ -147,17 +143,20 @@ def test_paired_difference_of_interquartile_means():
     assert (low, high) == pytest.approx(theirs, abs=4 * 0.05 * np.std(differences))
     same = paired_difference(a, b, statistic=mean_over_environments)
     assert same == paired_difference(a, b) and same[0] != value
-    other = paired_difference(a, b, seed=1)
-    assert other[0] == same[0] and other[1:] != same[1:]
 
 
 @pytest.mark.parametrize("statistic", [mean_over_environments, interquartile_mean])
-@pytest.mark.parametrize("seed", range(5))
-def test_exchanged_methods_have_the_negative_difference(seed, statistic):
-    """The result is equal to the last bit if the methods are exchanged and the sign is changed."""
-    a, b = two_methods(seed)
-    value, low, high = paired_difference(a, b, statistic=statistic, seed=seed)
-    assert paired_difference(b, a, statistic=statistic, seed=seed) == (-value, -high, -low)
+def test_exchanged_methods_have_the_negative_difference(statistic):
+    """The result is equal to the last bit if the methods are exchanged and the sign is changed, in any order of
+    environments and seeds."""
+    a, b = two_methods()
+    value, low, high = paired_difference(a, b, statistic=statistic)
+    random = np.random.default_rng(0)
+    one, other = shuffled(a, random), shuffled(b, random)
+    assert list(one["pipe"]) != list(a["pipe"])
+    assert paired_difference(other, one, statistic=statistic) == (-value, -high, -low)
+    assert paired_probability_of_improvement(one, other) == paired_probability_of_improvement(a, b)
+    assert stratified_bootstrap(plain(one), statistic) == stratified_bootstrap(plain(a), statistic)
 
 
 def test_only_shared_seeds_count():
@@ -250,7 +249,7 @@ def a_board(seed):
 @pytest.mark.parametrize("statistic", [mean_over_environments, interquartile_mean])
 def test_ranks_agree_with_the_definition(statistic, higher):
     """Ranks count significant paired differences, for random leaderboards in any order."""
-    for seed in range(12):
+    for seed in range(6):
         scores = a_board(seed)
         listed = {name: shuffled(scores[name], np.random.default_rng(seed)) for name in reversed(scores)}
         found = shared_ranks(listed, statistic=statistic, higher_is_better=higher, n_resamples=500)
@@ -263,23 +262,17 @@ def test_ranks_agree_with_the_definition(statistic, higher):
 
 
 @pytest.mark.parametrize(("call", "message"), [
-    (lambda: interquartile_mean(), "scores must hold"),
-    (lambda: interquartile_mean([]), "scores must hold"),
-    (lambda: mean_over_environments([1.0], []), "scores must hold"),
-    (lambda: stratified_bootstrap({}, interquartile_mean), "scores_by_stratum must hold"),
-    (lambda: stratified_bootstrap({"pipe": []}, interquartile_mean), "scores_by_stratum must hold"),
-    (lambda: stratified_bootstrap({"pipe": np.ones((3, 3))}, interquartile_mean), "scores_by_stratum must hold"),
-    (lambda: stratified_bootstrap({"pipe": [1.0, math.nan]}, interquartile_mean), "scores_by_stratum must hold finite"),
-    (lambda: stratified_bootstrap({"pipe": NOISE}, np.mean), "statistic must reduce the last axis only"),
-    (lambda: stratified_bootstrap({"pipe": NOISE}, interquartile_mean, n_resamples=0),
-     "n_resamples must be at least 1"),
-    (lambda: paired_difference({"pipe": seeded(NOISE)}, {"pipe": seeded(NOISE, "dev")}), "a and b must share a seed"),
-    (lambda: paired_difference({"pipe": seeded(NOISE)}, {"tank": seeded(NOISE)}), "environments must be the same"),
-    (lambda: paired_difference({}, {}), "a and b must hold finite scores"),
-    (lambda: paired_difference({"pipe": {"a": math.inf}}, {"pipe": {"a": math.inf}}), "a and b must hold finite"),
-    (lambda: shared_ranks(board(a=NOISE) | {"b": {"tank": seeded(NOISE)}}), "must be of the same episodes .* of b"),
-    (lambda: shared_ranks(board(a=NOISE, b=NOISE[:7])), "must be of the same episodes .* of b"),
-    (lambda: shared_ranks({"a": {"pipe": {}}}), "scores must be finite, of at least one"),
+    (lambda: stratified_bootstrap({}, interquartile_mean), "scores must be finite"),
+    (lambda: stratified_bootstrap({"pipe": []}, interquartile_mean), "scores must be finite"),
+    (lambda: stratified_bootstrap({"pipe": np.ones((3, 3))}, interquartile_mean), "scores must be finite"),
+    (lambda: stratified_bootstrap({"pipe": [1.0, math.nan]}, interquartile_mean), "scores must be finite"),
+    (lambda: paired_difference({"pipe": seeded(NOISE)}, {"pipe": seeded(NOISE, "dev")}), "compared methods share"),
+    (lambda: paired_difference({"pipe": seeded(NOISE)}, {"tank": seeded(NOISE)}), "environments must .* pipe and tank"),
+    (lambda: paired_difference({}, {}), "scores must be finite"),
+    (lambda: paired_difference({"pipe": {"a": math.inf}}, {"pipe": {"a": math.inf}}), "scores must be finite"),
+    (lambda: shared_ranks(board(a=NOISE) | {"b": {"tank": seeded(NOISE)}}), "environments must be the same"),
+    (lambda: shared_ranks(board(a=NOISE, b=NOISE[:7])), "must be of the same episodes, got others of a"),
+    (lambda: shared_ranks({"a": {"pipe": {}}}), "scores must be finite"),
 ])
 def test_errors_name_the_argument(call, message):
     """The message explains the reason."""
@@ -292,16 +285,3 @@ def test_constant_environments_have_no_interval(statistic):
     """Two environments that always score 0.25 and 0.75 have an interval of length zero."""
     scores = {"pipe": [0.25] * 8, "tank": [0.75] * 8}
     assert stratified_bootstrap(scores, statistic) == (0.5, 0.5, 0.5)
-
-
-@pytest.mark.parametrize("order", range(3))
-def test_the_order_of_episodes_does_not_matter(order):
-    """Pairs are matched by their seeds, and intervals are equal to the last bit."""
-    random = np.random.default_rng(order)
-    a, b = two_methods()
-    one, other = shuffled(a, random), shuffled(b, random)
-    assert list(one["pipe"]) != list(a["pipe"])
-    assert paired_difference(one, other) == paired_difference(a, b)
-    assert paired_probability_of_improvement(one, other) == paired_probability_of_improvement(a, b)
-    for statistic in (interquartile_mean, mean_over_environments):
-        assert stratified_bootstrap(plain(one), statistic) == stratified_bootstrap(plain(a), statistic)
