@@ -33,8 +33,6 @@ from eitbench.data.seeds import parse_seeds
 
 BUILTIN_FIELDS = ("environment", "method", "board", "role", "privileged")
 """Fields that must be equal in a rerun of a built-in method; its title may have changed."""
-SCORE_TOLERANCE = 1e-6
-"""Accepted relative difference of scores: the order of summation depends on the processor."""
 MANY_ROWS = 30
 """Above this number of episodes a table has a row for each environment instead."""
 EMPTY_ROW = {"record": "", "environment": "", "method": "", "episode": "", "isolation": "",
@@ -88,10 +86,10 @@ def verify(paths: Sequence[Path], folder: Path, *, file: str | None = None, isol
             cases.append(EpisodeCheck(record, episode, numbered))
     with use_cache_dir((folder / "cache").absolute()):
         if replay:
-            bar = tqdm(run_parallel(_replayed_row, [(case,) for case in cases], n_jobs, backend),
-                       total=len(cases), desc="replaying", unit="episode", disable=None)
-            rows += sorted(
-                bar, key=lambda row: (row["record"], len(row["episode"]), row["episode"]))
+            work = [(k, case.record, case.episode) for k, case in enumerate(cases)]
+            bar = tqdm(run_parallel(_replay, work, n_jobs, backend), total=len(work),
+                       desc="replaying", unit="episode", disable=None)
+            rows += [_compared(cases[k], result, []) for k, result in sorted(bar)]
         else:
             rows += _rerun_rows(cases, folder, n_jobs, backend)
     return pd.DataFrame([EMPTY_ROW | row for row in rows])
@@ -146,15 +144,16 @@ def job_for_record(record: dict[str, Any], file: str | None = None, isolate: str
     """Return the job, with seed 0, that a record describes. The method is in ``file``; by default
     the built-in or installed one of that name, or the file with the record's sha256 in the folder
     ``submitted``. ``ValueError`` if no file is found, or it does not match the record."""
-    environment = Environment(record["environment"]["id"],
-                              json.dumps(record["environment"]["kwargs"]))
-    method = str(Path(file).absolute()) if file else _known(record) or _submitted(record, submitted)
-    if method is None:
-        raise ValueError(f"{record['method']} is not a built-in method, and its file is not in the "
-                         "folder methods next to the records: pass it as --method, or replay a "
-                         "policy's recorded actions with --replay")
-    path = methods.find_method(method, environment.track)
+    environment = _environment(record)
     built_in = methods.builtin_files(environment.id).get(record["method"])
+    known = built_in or methods.installed_methods().get(record["method"])
+    if file:
+        method = str(Path(file).absolute())
+    elif known:
+        method = record["method"] if known.suffix == ".py" else str(known)
+    else:
+        method = _submitted(record, submitted)
+    path = methods.find_method(method, environment.track)
     if is_builtin(method) and not (built_in and path.samefile(built_in)):
         raise ValueError(f"{path} must be the method of the record, {record['method']}, got "
                          "another built-in method")
@@ -166,17 +165,12 @@ def job_for_record(record: dict[str, Any], file: str | None = None, isolate: str
     return isolated_job(environment, method, isolate, strict=True)
 
 
-def _known(record: dict[str, Any]) -> str | None:
-    """Return the built-in or installed method with the record's name."""
-    name = record["method"]
-    installed = methods.installed_methods()
-    path = (methods.builtin_files(record["environment"]["id"]) | installed).get(name)
-    if path is None:
-        return None
-    return name if path.suffix == ".py" and name not in installed else str(path)
+def _environment(record: dict[str, Any]) -> Environment:
+    environment = record["environment"]
+    return Environment(environment["id"], json.dumps(environment["kwargs"]))
 
 
-def _submitted(record: dict[str, Any], folder: Path | None) -> str | None:
+def _submitted(record: dict[str, Any], folder: Path | None) -> str:
     """Return the file in a folder or its subfolders that has the record's sha256."""
     for path in sorted(folder.rglob("*")) if folder else []:
         if not methods.is_path(path.name) or not path.is_file() or path.is_symlink():
@@ -184,7 +178,9 @@ def _submitted(record: dict[str, Any], folder: Path | None) -> str | None:
         with suppress(ValueError):              # a file that another method lacks
             if method_sha256(method_files(path)) == record["method_sha256"]:
                 return str(path)
-    return None
+    raise ValueError(f"{record['method']} is not a built-in method, and its file is not in the "
+                     "folder methods next to the records: pass it as --method, or replay a "
+                     "policy's recorded actions with --replay")
 
 
 def is_builtin_record(record: dict[str, Any], method: str) -> bool:
@@ -230,19 +226,20 @@ def _rerun_row(case: EpisodeCheck, store: EpisodeStore) -> dict[str, Any]:
         note = f"the record is of {record['version']}, and {record['method']} is now v{now}"
     if now and then and then > now:
         problems.append(f"the record is of {record['version']}, but {record['method']} is v{now}")
-    return _compared(case, result, job.isolation, problems) | {"note": note}
+    return _compared(case, result, problems) | {"note": note}
 
 
-def _replayed_row(case: EpisodeCheck) -> dict[str, Any]:
-    """Replay an episode and compare it with the record."""
+def _replay(k: int, record: dict[str, Any], episode: dict[str, Any]) -> tuple[int, dict[str, Any]]:
+    """Return ``k``, and the result of `replay_actions` or the reason why there is none."""
     try:
-        return _compared(case, replay_actions(case.record, case.episode), "replay", [])
+        return k, replay_actions(record, episode)
     except ValueError as error:
-        return _compared(case, case.episode, "", [str(error)]) | {"score": "", "rerun": None}
+        return k, {"status": "not replayed", "message": str(error)}
 
 
-def _compared(case: EpisodeCheck, result: dict[str, Any], isolation: str,
+def _compared(case: EpisodeCheck, result: dict[str, Any],
               problems: list[str]) -> dict[str, Any]:
+    """Return the row of an episode and its new result."""
     differences = score_differences(case.episode, result)
     worst = max(differences, key=lambda name: differences[name], default="")
     if result["status"] != case.episode["status"]:
@@ -252,7 +249,8 @@ def _compared(case: EpisodeCheck, result: dict[str, Any], isolation: str,
     return {"record": record_file_name(case.record),
             "environment": case.record["environment"]["id"],
             "method": case.record["method"], "episode": case.episode["seed"],
-            "isolation": isolation, "score": worst, "difference": differences.get(worst, 0.0),
+            "isolation": case.job.isolation if case.job else "replay",
+            "score": worst, "difference": differences.get(worst, 0.0),
             "recorded": recorded, "rerun": rerun, "problem": "; ".join(problems)}
 
 
@@ -262,11 +260,9 @@ def replay_actions(record: dict[str, Any], recorded: dict[str, Any]) -> dict[str
     actions = recorded.get("actions")
     if actions is None:
         raise ValueError(f"{recorded['seed']} has no recorded actions to replay")
-    environment = Environment(record["environment"]["id"],
-                              json.dumps(record["environment"]["kwargs"]))
     replay = methods.Method("injection", record["method"], record["title"], Path(), "",
                             (record["board"],), {}, lambda *_: _Replay(actions))
-    outcome = run_method(environment, replay, parse_seeds(recorded["seed"])[0]).outcome
+    outcome = run_method(_environment(record), replay, parse_seeds(recorded["seed"])[0]).outcome
     return {"status": "ok", "scores": compute_scores("injection", outcome),
             "step_errors": outcome.errors.tolist()}
 
@@ -311,7 +307,7 @@ def _relative(a: Sequence[float | None], b: Sequence[float | None]) -> float:
 # -- reports ------------------------------------------------------------------------------------
 
 
-def describe_problems(rows: pd.DataFrame, tolerance: float = SCORE_TOLERANCE) -> list[str]:
+def describe_problems(rows: pd.DataFrame, tolerance: float) -> list[str]:
     """Return a line for each episode whose rerun differs, and each record without a rerun."""
     sentences = []
     for _, row in rows[_differ(rows, tolerance)].iterrows():
@@ -327,7 +323,7 @@ def _differ(rows: pd.DataFrame, tolerance: float) -> pd.Series:
     return (rows["difference"] > tolerance) | (rows["problem"] != "")
 
 
-def verification_table(rows: pd.DataFrame, tolerance: float = SCORE_TOLERANCE) -> str:
+def verification_table(rows: pd.DataFrame, tolerance: float) -> str:
     """Return Markdown with a row for each episode, or for each environment (see `MANY_ROWS`)."""
     by = ["environment"] if len(rows) > MANY_ROWS else ["record", "episode"]
     lines: list[dict[str, Cell | str]] = []

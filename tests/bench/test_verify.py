@@ -29,6 +29,7 @@ CURRENTS = "eitbench/Pipe2DInjectionCurrents-v0"
 SECRET = bytes(range(32))
 AGREE = "1 of 1 records agree"
 HERE = ("-j", 1, "--isolate", "process")
+REDUCED = ("--seeds", "dev:0", "--estimator", "reduced", "-j", 1)
 confined = pytest.mark.skipif(bool(bubblewrap_problem()), reason=bubblewrap_problem() or "bubblewrap works")
 
 
@@ -43,10 +44,10 @@ def tiny_world(monkeypatch, tmp_path):
     isolation.close()
 
 
-def submitted(method, seeds="test:0", env=FILTER.id, kind="--baseline"):
+def submitted(method, seeds="test:0", env=FILTER.id):
     """Return the path of a record made as README describes."""
-    code, said, complaint = eitbench("submit", kind, method, "--env", env, *HERE, "--to", "board/results",
-                                     "--seeds", seeds)
+    code, said, complaint = eitbench("submit", "--baseline", method, "--env", env, "-j", 1, "--isolate", "none",
+                                     "--to", "board/results", "--seeds", seeds)
     assert code == 0, complaint
     return Path(said.split(":")[0].removeprefix("wrote "))
 
@@ -104,17 +105,16 @@ def own(submission, tmp_path):
 # -- reruns -------------------------------------------------------------------------------------
 
 
-def test_a_valid_record_agrees(mine):
+def test_a_valid_record_agrees():
     """Episodes are simulated again and chosen by the seed; the output is a Markdown table."""
-    path = submitted(mine, "test:0-3")
-    command = ("verify", path, "--method", mine, "--episodes", 2, "--seed", 5, *HERE)
+    path = submitted("homogeneous", "test:0-3")
+    command = ("verify", path, "--episodes", 2, "--seed", 5, "-j", 1)
     code, said, complaint = eitbench(*command)
     assert code == 0 and AGREE in said and "--seed 5" in said, complaint
-    assert len(re.findall(r"\| test:\d +\| process +\|.*\| none +\|", said)) == 2
+    assert len(re.findall(r"\| test:\d +\| none +\|.*\| none +\|", said)) == 2
     assert eitbench(*command)[1] == said
-    found = re.findall(r"test:\d", said)
-    table = verification.verify([path], Path("again"), file=mine, isolate="process", episodes=2, seed=6)
-    assert list(table["episode"]) != found
+    table = verification.verify([path], Path("again"), episodes=2, seed=6)
+    assert list(table["episode"]) != re.findall(r"test:\d", said)
 
 
 @confined
@@ -128,14 +128,12 @@ def test_a_third_party_file_runs_under_bubblewrap(mine, own):
     assert code == 0 and "| bubblewrap" in said and AGREE in said, complaint
 
 
-def test_built_in_methods_are_known_by_name(tmp_path):
-    """Policies, privileged methods and failures are verified too, with the arguments of the record."""
-    for name in ("random_pair", "clairvoyant"):
-        assert eitbench("run", "--env", INJECTION, "--policy", name, "--seeds", "dev:0", "--estimator", "reduced",
-                        "-j", 1)[0] == 0
-        (path,) = tmp_path.glob(f"results/records/*--{name}--*")
-        code, said, complaint = eitbench("verify", path, "-j", 1)
-        assert code == 0 and "dev:0" in said, complaint
+def test_privileged_policies_and_failures_are_verified(tmp_path):
+    """Built-in methods are known by name, and run with the arguments of the record; a failure agrees with a failure."""
+    assert eitbench("run", "--env", INJECTION, "--policy", "clairvoyant", *REDUCED)[0] == 0
+    (path,) = tmp_path.glob("results/records/*--clairvoyant--*")
+    code, said, complaint = eitbench("verify", path, "-j", 1)
+    assert code == 0 and "dev:0" in said, complaint
     fails = write_baseline(tmp_path, "fails", update="if voltages[0] != 0.0: raise ValueError('dry')")
     path = submitted(fails)
     assert eitbench("verify", path, "--method", fails, *HERE)[0] == 0
@@ -149,17 +147,20 @@ def failed(record):
     episode |= {"status": "failed", "message": "RuntimeError: oh", "where": "mine.py:1"}
 
 
-@pytest.mark.parametrize(("change", "arguments", "message"), [
-    (better, [], r"test:0: \w+ differs by 0\.1"), (failed, [], "status is ok"),
-    (lambda record: record.update(title="Theirs"), [], "title is 'Mine', but 'Theirs' in the record"),
-    (lambda record: better(record, 1.0 + 1e-4), ["--tolerance", "5e-5"], "differs by 0.0001"),
-    (lambda record: better(record, 1.0 + 1e-4), ["--tolerance", "1e-3"], ""),
-], ids=["better", "failed", "title", "beyond the tolerance", "within"])
-def test_changed_records_are_found(change, arguments, message, mine, own):
-    """The digest matches the changed content."""
-    path = changed(own, change)
-    code, said, complaint = eitbench("verify", path, "--method", mine, *HERE, *arguments)
-    assert code == bool(message) and re.search(message, complaint) and (AGREE in said) != bool(message)
+def test_changed_records_are_found(mine, own):
+    """The digest matches the changed content. The file of each record is found in the folder next to it."""
+    changes = {"better": better, "failed": failed, "title": lambda record: record.update(title="Theirs"),
+               "almost": lambda record: better(record, 1.0 + 1e-4)}
+    paths = {name: changed(own, change, f"{name}/results") for name, change in changes.items()}
+    for name in changes:
+        Path(name, "methods").mkdir()
+        shutil.copy(mine, Path(name, "methods"))
+    code, _, complaint = eitbench("verify", *paths.values(), *HERE, "--out", "again")
+    assert code == 1 and complaint.count("differs: ") == 4
+    for message in (r"test:0: \w+ differs by 0\.1 ", "status is ok", r"differs by 0\.0001 ",
+                    "title is 'Mine', but 'Theirs' in the record"):
+        assert re.search(message, complaint), message
+    assert eitbench("verify", paths["almost"], *HERE, "--out", "again", "--tolerance", "1e-3")[0] == 0
 
 
 def test_differences_of_numbers():
@@ -209,7 +210,7 @@ def test_only_numbers_of_built_in_methods_are_compared(monkeypatch):
     assert code == 0 and "the record is of v1, and homogeneous is now v2" in said
 
 
-def test_the_cache_is_not_used(mine, tmp_path, monkeypatch):
+def test_the_cache_is_not_used(tmp_path, monkeypatch):
     """A score from a cache in which test:0 is another, easier episode does not agree."""
     monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path / "cache"))
     world, seed = TINY, parse_seeds("test:0")[0]
@@ -218,9 +219,9 @@ def test_the_cache_is_not_used(mine, tmp_path, monkeypatch):
     shutil.rmtree(folder(world))
     with monkeypatch.context() as patch:
         patch.setattr("eitbench.data.episodes.simulate_batch", lambda *_: iter([flat]))
-        path = submitted(mine)
+        path = submitted("homogeneous")
     assert list(folder(world).glob("*.truth.npy"))
-    assert eitbench("verify", path, "--method", mine, *HERE)[0] == 1
+    assert eitbench("verify", path, "-j", 1)[0] == 1
     assert cache_folder() == tmp_path / "cache"
 
 
@@ -230,12 +231,12 @@ def test_the_cache_is_not_used(mine, tmp_path, monkeypatch):
 def test_all_official_records_are_verified_and_a_false_one_is_reported(monkeypatch):
     """A repeated command resumes. Damaged files are reported before any episode is run."""
     for env in (FILTER.id, SMOOTHING.id):
-        changed(submitted("homogeneous", "test:0-2", env), official)
-    changed(submitted("persistence", "test:0-2"), lambda record: None)               # self-reported: not verified
+        changed(submitted("homogeneous", "test:0-1", env), official)
+    changed(submitted("persistence", "test:0-1"), lambda record: None)               # self-reported: not verified
     command = ("verify", "--all", "--records", "forged/results", "--out", "again", "--episodes", 2, "-j", 1)
     code, said, complaint = eitbench(*command)
     assert code == 0 and "2 of 2 records agree" in said and "persistence" not in said, complaint
-    false = changed(submitted("persistence", "test:0-2"), lambda record: (official(record), better(record, 0.5)))
+    false = changed(submitted("persistence", "test:0-1"), lambda record: (official(record), better(record, 0.5)))
     ran = []
     monkeypatch.setattr(run, "run_episode", lambda job: ran.append(job.method) or run_episode(job))
     code, said, complaint = eitbench(*command)
@@ -277,7 +278,9 @@ class Policy:
 def test_recorded_actions_are_replayed_without_the_policy(env, monkeypatch):
     """For pairs and currents, other actions give other scores, and a missing action is reported."""
     Path("drawn.py").write_text(DRAWN)
-    path = submitted("random_pair" if env == INJECTION else "drawn.py", env=env, kind="--policy")
+    policy = "random_pair" if env == INJECTION else "drawn.py"
+    assert eitbench("run", "--env", env, "--policy", policy, "--isolate", "none", *REDUCED)[0] == 0
+    (path,) = Path("results/records").iterdir()
     record = read_record(path)
     assert len(record["episodes"][0]["actions"]) > 1
 
@@ -292,11 +295,12 @@ def test_recorded_actions_are_replayed_without_the_policy(env, monkeypatch):
         actions = record["episodes"][0]["actions"]
         actions[0], actions[1] = actions[1], actions[0]
 
-    assert eitbench("verify", changed(path, other_first), "--replay", "-j", 1)[0] == 1
-    for change, message in ((lambda record: record["episodes"][0]["actions"].pop(), "must have one entry"),
-                            (lambda record: record["episodes"][0].pop("actions"), "has no recorded actions")):
-        code, _, complaint = eitbench("verify", changed(path, change), "--replay", "-j", 1)
-        assert code == 1 and message in complaint
+    changes = {r"\w+ differs by": other_first,
+               "has no recorded actions": lambda record: record["episodes"][0].pop("actions"),
+               "must have one entry": lambda record: record["episodes"][0]["actions"].pop()}
+    paths = [changed(path, change, f"{k}/results") for k, change in enumerate(changes.values())]
+    code, _, complaint = eitbench("verify", *paths, "--replay", "-j", 1)
+    assert code == 1 and all(re.search(message, complaint) for message in changes), complaint
 
 
 # -- held-out episodes --------------------------------------------------------------------------
@@ -346,15 +350,15 @@ def test_error_rates_of_the_held_out_test(gain, low, high):
 @confined
 def test_held_out_episodes_detect_memorised_ones(mine, monkeypatch):
     """Seeds and secret are neither printed nor passed to the worker; third-party files need bubblewrap."""
-    public = submitted(mine, "test:0-7")
-    claim = ("--episodes", 0, "--held-out", 6, "--secret", write_secret(), "--method", mine, "-j", 1)
+    public = submitted(mine, "test:0-4")
+    claim = ("--episodes", 0, "--held-out", 4, "--secret", write_secret(), "--method", mine, "-j", 1)
     passed = []
     encode = isolation.encode_message
     monkeypatch.setattr(isolation, "encode_message", lambda *message: passed.append(encode(*message)) or passed[-1])
     code, said, complaint = eitbench("verify", public, *claim)
-    assert code == 0 and hashlib.sha256(SECRET).hexdigest() in said and re.search(r"\(8\).*\(6\)", said), complaint
-    assert sum(b'"update"' in message for message in passed) == 6 * 5
-    for seed in held_out_seeds(SECRET, 6):
+    assert code == 0 and hashlib.sha256(SECRET).hexdigest() in said and re.search(r"\(5\).*\(4\)", said), complaint
+    assert sum(b'"update"' in message for message in passed) == 4 * 5
+    for seed in held_out_seeds(SECRET, 4):
         spellings = (str(seed).encode(), seed.to_bytes(8, "little"), seed.to_bytes(8, "big"))
         assert not any(each in message for each in spellings for message in passed) and str(seed) not in said
     assert SECRET.hex() not in said
