@@ -211,33 +211,32 @@ def method_files(path: Path) -> dict[str, bytes]:
     names in ``files = ("weights.npz",)``, or that `eitbench.rl.save_agent` writes with a model.
 
     The source is parsed, not executed. ``ValueError`` if a named file is not in the folder."""
-    source = path.read_bytes()
+    source = _content(path)
     if path.suffix != ".py":
         return {path.name: source} | {name: path.with_name(name).read_bytes()
                                       for name in AGENT_FILES if path.with_name(name).is_file()}
     contents = {path.name: source}
-    for name in _named_files(path, source):
+    try:
+        names = _class_attribute(source, "files", ())
+    except SyntaxError:             # loading reports the error
+        names = ()
+    except ValueError:              # not a literal
+        names = None
+    if not isinstance(names, tuple) or not all(isinstance(each, str) for each in names):
+        raise ValueError(f"{path}: files must be a literal tuple of names of files")
+    for name in names:
         file = path.with_name(name) if name == Path(name).name else Path()
         if not file.is_file():
             raise ValueError(f"{path}: files must name files in the folder of the method, got "
                              f"{name!r}, which does not exist there")
-        if file.stat().st_size > MAX_METHOD_BYTES:
-            raise ValueError(f"{file} must have {MAX_METHOD_BYTES >> 20} MiB at most")
-        contents[name] = file.read_bytes()
+        contents[name] = _content(file)
     return contents
 
 
-def _named_files(path: Path, source: bytes) -> tuple[str, ...]:
-    """Return the ``files`` of the class `Estimator` or `Policy`; empty without any."""
-    try:
-        names = _class_attribute(source, "files", ())
-        if isinstance(names, tuple) and all(isinstance(each, str) for each in names):
-            return names
-    except SyntaxError:
-        return ()                   # loading reports the error
-    except ValueError:
-        pass
-    raise ValueError(f"{path}: files must be a literal tuple of names of files")
+def _content(path: Path) -> bytes:
+    if path.stat().st_size > MAX_METHOD_BYTES:
+        raise ValueError(f"{path} must have {MAX_METHOD_BYTES >> 20} MiB at most")
+    return path.read_bytes()
 
 
 def _class_attribute(source: bytes, name: str, default: Any) -> Any:
@@ -288,8 +287,6 @@ def find_method(name: str, track: str) -> Path:
     if not path.is_file():
         hint = f": {AGENTS_NOT_BUNDLED}" if "checkpoints" in path.parts else ""
         raise ValueError(f"{form.kind} {path} does not exist, or is not a file{hint}")
-    if path.stat().st_size > MAX_METHOD_BYTES:
-        raise ValueError(f"{form.kind} {path} must have {MAX_METHOD_BYTES >> 20} MiB at most")
     if path.stem in own and not path.samefile(folder / f"{path.stem}.py"):
         raise ValueError(f"{form.kind} {path} has the name of a built-in method, under which "
                          "results are stored; rename it")

@@ -217,20 +217,19 @@ def split_outdated(records: list[dict[str, Any]],
     record is superseded only by a higher official one. All versions of third-party methods, which
     have no order, are current.
     """
-    highest: dict[tuple[Any, ...], int] = {}
+    versions: dict[tuple[str, ...], list[tuple[int, bool]]] = {}
     for record in records:
-        number = version_number(record["version"]) or 0
-        # an official version supersedes all records, another version only unofficial ones
-        for official in {False, record["official"]}:
-            key = (*_lineage(record), official)
-            highest[key] = max(highest.get(key, 0), number)
-    current: list[dict[str, Any]] = []
-    outdated: list[dict[str, Any]] = []
-    for record in records:
-        latest = highest[(*_lineage(record), record["official"])]
-        is_current = version_number(record["version"]) in (None, latest)
-        (current if is_current else outdated).append(record)
-    return current, outdated
+        versions.setdefault(_lineage(record), []).append(
+            (version_number(record["version"]) or 0, record["official"]))
+
+    def is_outdated(record: dict[str, Any]) -> bool:
+        number = version_number(record["version"])
+        return number is not None and any(
+            other > number and (official or not record["official"])
+            for other, official in versions[_lineage(record)])
+
+    return ([record for record in records if not is_outdated(record)],
+            [record for record in records if is_outdated(record)])
 
 
 def _lineage(record: dict[str, Any]) -> tuple[str, ...]:

@@ -25,7 +25,6 @@ from eitbench.data.seeds import allow_test_seeds
 from eitbench.envs.estimation import EstimationEnv
 from eitbench.envs.injection import InjectionEnv
 from eitbench.estimation import best_homogeneous
-from eitbench.estimation.walk import RandomWalk
 from eitbench.physics.cross_section import outlet_of
 from eitbench.physics.transport import ConvectionDiffusion
 from eitbench.worlds.random_streams import episode_streams, generator_from_state
@@ -106,19 +105,12 @@ def run_on_measurements(env: MeasuredEnv, method: str | Method, seed: int = 0, *
                          f"{method.name} for {', '.join(method.subtracks)}")
     env.reset(seed=seed)                            # sets the task before the time measurement
     if not method.suits(env.task):
-        raise ValueError(f"method must suit a target that {_motion(env.task)}, got {method.name}")
+        raise ValueError("method must suit vessel, flow and target of the measurements, got "
+                         f"{method.name}")
     with threadpool_limits(1):
         steps = tqdm(_iter_steps(env, method, seed), total=env.episode_steps, desc=method.name,
                      unit="measurement", disable=None, leave=False)
         return MeasuredRun(env, method.name, steps, kept)
-
-
-def _motion(task: Task) -> str:
-    if task.is_stationary:
-        return "is stationary"
-    if isinstance(task.transport, RandomWalk):
-        return "follows a random walk"
-    return f"is advected by a flow that is {'known' if task.velocity is None else 'estimated'}"
 
 
 def run_estimator(env: EstimationEnv, estimator: Method, seed: int) -> EpisodeRun:

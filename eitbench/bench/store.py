@@ -40,8 +40,8 @@ from eitbench.data.seeds import format_seed
 PACKAGES = ("eitbench", "numpy", "scipy", "gymnasium", "scikit-fem", "numba", "stable-baselines3",
             "sb3-contrib", "torch")
 """Packages whose versions are part of a record."""
-_OUTPUTS = ("--out", "-o", "--to")
-"""Command-line options for output folders, which do not affect scores."""
+_OPTION = re.compile(r"^(--?[\w-]+=|-[a-z])")
+"""Name of an option that is joined to its value."""
 
 
 class EpisodeStore:
@@ -249,17 +249,10 @@ def provenance() -> dict[str, Any]:
 
 
 def portable_command(command: str) -> str:
-    """Return a command without machine-specific paths: options for output folders are removed, and
-    other paths that are absolute or contain ``..`` are reduced to their last component."""
-    words = iter(shlex.split(command))
-    kept = []
-    for word in words:
-        option, equals, value = word.partition("=")
-        if word in _OUTPUTS:
-            next(words, None)
-        elif option not in _OUTPUTS and not re.match(r"-o[^-]", word):
-            kept.append(f"{option}={_portable(value)}" if equals else _portable(word))
-    return shlex.join(kept)
+    """Return a command without the folders of the machine: paths that are absolute or contain
+    ``..``, also those behind ``--option=`` or ``-o``, are reduced to their last component."""
+    words = (_OPTION.split(word, maxsplit=1) for word in shlex.split(command))
+    return shlex.join("".join(each[:-1]) + _portable(each[-1]) for each in words)
 
 
 def _portable(word: str) -> str:

@@ -10,8 +10,7 @@ from eitbench.bench import suites, tracks
 from eitbench.bench.records import read_record, split_of, write_record
 from eitbench.bench.run import Job, pending_jobs, run_jobs
 from eitbench.bench.store import EpisodeStore, provenance, record_results
-from eitbench.bench.text import seed_ranges
-from eitbench.data.seeds import format_seed
+from eitbench.data.seeds import format_seed, seed_ranges
 
 
 def submit(method: str | None, environments: list[str], seeds: list[int] | None,
@@ -39,15 +38,15 @@ def submit(method: str | None, environments: list[str], seeds: list[int] | None,
         raise ValueError(f"seeds must be of the split test, got {', '.join(others)}")
     if method is not None and not environments:
         raise ValueError("env must name at least one environment to submit for")
-    asked: Iterable[list[Job]] = (_jobs(method, id, policy, seeds, isolate, official)
-                                  for id in environments or tracks.ids())
+    track = "injection" if policy else "estimation"
+    known = {id: tracks.track_of(id) for id in environments or tracks.ids()}
+    asked: Iterable[list[Job]] = (
+        suites.make_jobs(track if method else own, [id], [method] if method else [], seeds,
+                         isolate=isolate, strict=official) for id, own in known.items())
     if method is not None:
         asked = list(asked)
         for jobs in asked:
             _earlier(Path(to), jobs, official)
-    else:
-        for id in environments:
-            tracks.track_of(id)
     return (path for jobs in asked
             for path in _submitted(jobs, store, Path(to), official, n_jobs, backend, command))
 
@@ -75,15 +74,6 @@ def _submitted(jobs: list[Job], store: EpisodeStore, to: Path, official: bool, n
                                  f"{path} would lose its episodes {seed_ranges(missing)}")
     for record in made:
         yield write_record(to, record)
-
-
-def _jobs(method: str | None, id: str, policy: bool, seeds: list[int] | None,
-          isolate: str, official: bool) -> list[Job]:
-    """Return the jobs of one environment."""
-    methods = [] if method is None else [method]
-    asked = "injection" if policy else "estimation"
-    track = tracks.track_of(id) if method is None else asked
-    return suites.make_jobs(track, [id], methods, seeds, isolate=isolate, strict=official)
 
 
 def _versions(jobs: list[Job]) -> list[tuple[str, str, str]]:

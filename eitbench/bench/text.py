@@ -10,7 +10,7 @@ from scipy.stats import t as student
 
 from eitbench.bench.scores import scores
 from eitbench.bench.tracks import is_measured
-from eitbench.data.seeds import seed_ranges as seed_ranges  # for users of this module too
+from eitbench.data.seeds import seed_ranges
 
 
 def mean_and_interval(values: list[float]) -> tuple[float, float]:

@@ -150,7 +150,6 @@ def method_files(monkeypatch, tmp_path):
 @pytest.mark.parametrize(("name", "change", "message"), [
     ("homogeneous", lambda episode: episode["scores"].update(error=episode["scores"]["error"] * (1 + 1e-5)),
      "error differs by "),
-    ("homogeneous", lambda episode: episode["last"].__setitem__(0, 1.01 * episode["last"][0]), "last differs by "),
     ("best_pair", lambda episode: episode["injections"].__setitem__(0, [0, 1]), "injections is ")])
 def test_changed_numbers_are_written_only_as_a_new_version(name, change, message, method_files):
     """Exit status 1 with the method's name and the number; ``--new-version`` writes the next version."""

@@ -14,7 +14,7 @@ from eitbench.data.episode_cache import mass_between
 from eitbench.numerics.fem import mass_matrix
 from eitbench.worlds import entry
 
-from injection_envs import BUDGET, FAULTS, FLOW, NAME, make
+from injection_envs import FAULTS, FLOW, NAME, make
 from short import world
 
 SEED = 5
@@ -42,7 +42,7 @@ def again(name: str, currents: np.ndarray) -> dict[str, list]:
     return seen
 
 
-@pytest.mark.parametrize("name", [FAULTS, BUDGET, FLOW])
+@pytest.mark.parametrize("name", [FAULTS, FLOW])
 def test_uncertainty_is_of_the_filter_inside_the_environment(name):
     """CRPS, coverage and var/MSE equal their formulas for mean, standard deviation and truth at the truth nodes of the
     scored region; NIS/m is the mean over the injections with accepted measurements."""

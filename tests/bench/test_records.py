@@ -3,10 +3,8 @@
 import hashlib
 import json
 import os
-import random
 import warnings
 
-import jsonschema
 import jsonschema_rs
 import pytest
 from eitbench._files import bundled_path
@@ -99,36 +97,27 @@ def test_the_digest_is_as_the_schema_defines():
 
 @pytest.mark.parametrize(("path", "value", "message"), [
     ("schema", 1, r"\$\.schema: 3 was expected"),
-    ("source", sha("code"), "'source' was unexpected"),
     ("version", "1", r'\$\.version: "1" does not match'),
     ("version", "deadbeef", r"\$\.version: must be v1, v2, … or the first eight digits of method_sha256"),
     ("version", ..., '"version" is a required property'),
     ("title", "Fine |\n| 1 | Forged |", r"\$\.title: "),
-    ("title", "a\x1b[2Jb", r"\$\.title: .* is not allowed"),
     ("title", "a\u202eb", r"\$\.title: .* is not allowed"),
-    ("method", "mi\u200bne", r"\$\.method: "),
     ("board", "smooth", r'\$\.board: "smooth" is not one of'),
     ("role", "best", r'\$\.role: "best" is not one of'),
     ("official", "no", r'\$\.official: "no" is not of type "boolean"'),
     ("method", "../mine", r'\$\.method: "../mine" does not match'),
-    ("checkpoint_sha256", "5ha", r"\$\.checkpoint_sha256: "),
-    ("seeds", [], r"\$\.seeds: "),
     ("score", 1, "'score' was unexpected"),
-    ("seeds", ["test:0"] * 10_001, r"\$\.seeds: .*has more than 10000 items"),
-    ("episodes.0.step_errors", [0.1] * 100_001, r"\$\.episodes\[0\]\.step_errors: .*has more than 100000 items"),
     ("episodes.1.step_errors", [0.25, 0.25], r"\$\.episodes: must have the same number of step_errors each"),
+    ("checkpoint_sha256", "a" * 64 + "\n", r"\$\.checkpoint_sha256: "),           # Python's $ matches before a line end
     ("episodes.0.scores.nis", 1e51, r"\$\.episodes\[0\]\.scores\.nis: 1e\+51 is greater than the maximum"),
     ("episodes.0.scores.nis", 1e-101, r"\$\.episodes\[0\]\.scores\.nis: .* is not allowed for 1e-101"),
     ("episodes.0.step_errors", [1e60], r"\$\.episodes\[0\]\.scores\.error: must be the mean of step_errors"),
-    ("environment.id", "Pipe2D", r'\$\.environment\.id: "Pipe2D" does not match'),
-    ("environment.name", "eitbench-Pipe3D-v0", r"\$\.environment\.name: must be eitbench-Pipe2D-v0, as id and"),
     ("environment.kwargs", {"lag": 3}, r"\$\.environment\.name: must be eitbench-Pipe2D-v0-\w{8}, as id and"),
     ("environment.kwargs", {"scenario": 10_000 * "x"}, r"\$\.environment\.kwargs: must have 10000 characters at most"),
     ("runs.0.commit", ..., r'\$\.runs\[0\]: "commit" is a required property'),
     ("runs.0.isolation", "jail", r'\$\.runs\[0\]\.isolation: "jail" is not one of'),
     ("episodes.0.scores.error", -1.0, r"\$\.episodes\[0\]\.scores\.error: -1.0 is less than the minimum"),
     ("episodes.0.scores.error", 0.05, r"\$\.episodes\[0\]\.scores\.error: must be the mean of step_errors"),
-    ("episodes.0.scores.beauty", "much", r'\$\.episodes\[0\]\.scores\.beauty: "much" is not of type'),
     ("episodes.0.scores.Beauty", 1.0, r"\$\.episodes\[0\]\.scores: Additional properties are not allowed \('Beauty'"),
     ("episodes.2.message", ..., r'\$\.episodes\[2\]: "message" is a required property'),
     ("episodes.2.scores", {"error": 0.1, "seconds_per_step": 0.1}, r"\$\.episodes\[2\]\.scores: "),
@@ -162,14 +151,10 @@ def test_seeds_have_one_name(seed, tmp_path):
 @pytest.mark.parametrize("run", [RUN | {"dirty": True}, RUN | {"commit": None, "dirty": None}])
 def test_official_records_need_a_clean_commit(run, tmp_path):
     """Records from modified code cannot be official."""
-    for official in (False, True):
-        mine = record("mine", [0.1], runs=[run], official=official)
-        if official:
-            with pytest.raises(ValueError, match=r"\$\.official: must be false unless all runs are of a commit"):
-                write_record(tmp_path, mine)
-        else:
-            write_record(tmp_path, mine)
+    write_record(tmp_path, record("mine", [0.1], runs=[run]))
     write_record(tmp_path, record("mine", [0.1], official=True))
+    with pytest.raises(ValueError, match=r"\$\.official: must be false unless all runs are of a commit"):
+        write_record(tmp_path, record("mine", [0.1], runs=[run], official=True))
 
 
 @pytest.mark.parametrize(("old", "new"), [("0.25", "0.24"), ("test:1", "test:7"), ("An abacus", "A computer"),
@@ -296,14 +281,6 @@ def test_values_that_json_lacks_are_reported_with_the_file(text, place, tmp_path
         read_record(path)
 
 
-@pytest.mark.parametrize("field", ["checkpoint_sha256", "version", "method_sha256"])
-def test_a_pattern_ends_where_the_text_does(field, tmp_path):
-    """Python's $ also matches before a final newline."""
-    made = with_content_hash(MINE | {field: (MINE[field] or "a" * 64) + "\n"})
-    with pytest.raises(ValueError, match="is not valid"):
-        read_record(write_unchecked(tmp_path, made, "it.json"))
-
-
 def test_large_and_special_files_are_not_opened(tmp_path):
     """Reading a pipe would never end."""
     path = tmp_path / "it.json"
@@ -315,27 +292,6 @@ def test_large_and_special_files_are_not_opened(tmp_path):
         with pytest.raises(ValueError, match=r"it\.json cannot be read: it must be a file of at most 8 MiB"):
             read_record(path)
         path.rmdir() if path.is_dir() else path.unlink()
-
-
-def places(value, path=()):
-    """Yield the paths of all values in a record."""
-    inner = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
-    return [path, *(place for key, each in inner for place in places(each, (*path, key)))]
-
-
-def test_another_validator_agrees():
-    """For any change of a record, jsonschema accepts and rejects the same, so that other tools can check the format."""
-    ours, theirs = (make(json.loads(SCHEMA)) for make in (
-        jsonschema_rs.validator_for, jsonschema.Draft202012Validator))
-    others = ["", "x" * 121, "a\x1bb", None, [], {}, 0, 0.5, 2**63, -1.0, 1e51, 5e-324, True, [None], {"a": {}}, ...]
-    chance, valid = random.Random(1), 0
-    for place in places(MINE)[1:]:
-        for value in chance.sample(others, 3):
-            made = changed(".".join(map(str, place)), value)
-            fits = ours.is_valid(made)
-            valid += fits
-            assert fits == theirs.is_valid(made), (place, value)
-    assert valid > 30
 
 
 @pytest.mark.parametrize("content", [b"", b"{", b"\xff\xfe", b"[]", b"null", b'{"schema": NaN}'])

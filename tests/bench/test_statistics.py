@@ -66,8 +66,8 @@ def test_interquartile_mean_pools_and_the_mean_does_not():
 @pytest.mark.parametrize(("n", "statistic", "expected"), [
     (6, mean_over_environments, 0.932), (10, interquartile_mean, 0.972)])
 def test_coverage(n, statistic, expected):
-    """The coverage of 1000 intervals for n normal numbers agrees with 6000 other data sets to 3 standard errors. Without
-    the expansion by Student's t it is too small, 0.854 and 0.937."""
+    """The coverage of 1000 intervals for n normal numbers agrees with 6000 other data sets to 3 standard errors.
+    Without the expansion by Student's t it is too small, 0.854 and 0.937."""
     random, held = np.random.default_rng(11), 0
     for _ in range(1000):
         _, low, high = stratified_bootstrap({"pipe": random.normal(3.0, 2.0, n)}, statistic, n_resamples=1000)
