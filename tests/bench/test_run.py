@@ -154,7 +154,7 @@ def test_oracle_with_the_true_model():
 def test_oracle_in_a_changing_flow(vessel):
     """Its error is smaller than the filter's with the first guess, and it returns the true flow; also if the inlet
     differs from the inlet of the fitted prior."""
-    changes = merged(FAST, {"schedule": {"scored_steps": 12}, "flow": {"velocity_range": [30.0, 60.0]},
+    changes = merged(FAST, {"schedule": {"scored_steps": 5}, "flow": {"velocity_range": [30.0, 60.0]},
                                 "vessel": vessel})
     world = Environment("eitbench/Pipe2DTimeVaryingVelocity-v0", json.dumps({"world": changes}))
     reference, guessing = (run_episode(Job(world, name, 3))[0]["scores"]
