@@ -25,10 +25,9 @@ from eitbench.bench import methods, runner, tracks
 from eitbench.bench.methods import is_path, load_method
 from eitbench.bench.scores import compute_scores, scores
 from eitbench.data import episode_cache
-from eitbench.data.episodes import Episode, cached_truth_model
+from eitbench.data.episodes import Episode, simulate_batch
 from eitbench.data.seeds import format_seed, parse_seeds
 from eitbench.estimation import best_homogeneous
-from eitbench.worlds.random_streams import episode_streams
 from eitbench.worlds.registry import entry
 from eitbench.worlds.task import make_task
 from eitbench.worlds.world import World
@@ -248,26 +247,12 @@ def _model_numbers(world: World) -> dict[str, Any]:
             "step": _sample(moved)}
 
 
-def _shown_steps(n_steps: int) -> list[int]:
-    """Return the steps, counted from 0, for which a golden file holds numbers."""
-    first = [0, 8, min(FIRST_STEPS, n_steps) - 1]
-    return first + [n_steps // 2, n_steps - 1] * (n_steps > FIRST_STEPS)
-
-
 @lru_cache(maxsize=4)
 def _episode(world: World, name: str) -> Episode:
-    """Simulate a golden episode; 𝓡 is NaN at steps that the golden file does not use."""
-    truth = cached_truth_model(world)
-    random = episode_streams(parse_seeds(name)[0])
+    """Simulate a golden episode of a world's `World.truth_config`, which variants share."""
     n_steps = min(WORLD_EPISODES[name] or world.n_steps, world.n_steps)
-    used = sorted({*range(world.calibration), *_shown_steps(n_steps)})
-    L = world.vessel.n_electrodes
-    (history,) = world.evolve([random], truth, lambda _: None, n_steps)
-    noise = random.noise.standard_normal((world.n_steps, L))[:n_steps]
-    resistance = np.full((n_steps, L, L), np.nan)
-    observation = world.true_observation(truth, random.contacts)
-    resistance[used] = observation.transfer_resistance(history.concentration[1:][used])
-    return Episode(history.concentration.astype(np.float32), resistance, noise, history.velocity)
+    (episode,) = simulate_batch(world, parse_seeds(name), False, n_steps)
+    return episode
 
 
 def _episode_numbers(world: World, name: str) -> dict[str, Any]:
@@ -287,7 +272,8 @@ def _episode_numbers(world: World, name: str) -> dict[str, Any]:
     errors = [float(episode_cache.step_error(mass, level, moments[k], deviations[k], squares[k]))
               for k in range(world.warm_up, len(entries))]
     faults = episode_cache.instrument_faults(world, seed)
-    steps = _shown_steps(len(entries))
+    n = len(entries)
+    steps = [0, 8, min(FIRST_STEPS, n) - 1] + [n // 2, n - 1] * (n > FIRST_STEPS)
     numbers = {
         "seed": format_seed(seed),
         "resistance": entries["transfer_resistance"][steps][:, [0, 0, 1, L // 2],
