@@ -13,10 +13,9 @@ from tqdm import tqdm
 
 from eitbench import _check
 from eitbench.bench.methods import METHOD_KINDS, Method, load_method, method_from_class
-from eitbench.bench.run import Job
+from eitbench.bench.run import Job, isolated_job
 from eitbench.bench.runner import run_method
 from eitbench.bench.scores import compute_scores
-from eitbench.bench.suites import isolated_job
 from eitbench.bench.tracks import Environment, qualified_name
 from eitbench.data.parallel import run_parallel
 from eitbench.data.seeds import format_seed, parse_seeds

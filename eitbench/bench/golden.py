@@ -118,14 +118,15 @@ def update(names: list[str], *, new_version: bool = False) -> Iterator[tuple[str
         computed = _computed(name, expected)
         moved = _differences(name, computed, expected) if expected else []
         status = "moved" if moved else "same" if expected else "new"
-        if status == "same" and "method" in expected:
+        is_method = "method" in computed
+        if expected and not moved and is_method:
             # scores introduced after the file was written are added; the others stay bit for bit
             computed = expected | {"episodes": [
                 old | {"scores": new["scores"] | old["scores"]}
                 for old, new in zip(expected["episodes"], computed["episodes"], strict=True)]}
-        elif status == "same":
+        elif expected and not moved:
             computed = expected
-        elif new_version and moved and "method" in expected:
+        elif moved and new_version and is_method:
             computed["version"] += 1
             status = f"v{computed['version']}"
         if status != "moved" and computed != expected:

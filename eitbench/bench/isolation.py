@@ -277,7 +277,8 @@ def _load(track: str, id: str, kwargs: str, method: str, isolation: str, path: P
         raise ValueError(f"{path} cannot be loaded: {str(error).removeprefix('ValueError: ')}"
                          ) from None
     about = worker.about
-    name = path.stem if path.suffix == ".py" else about.get("name")  # a worker may report any name
+    # a worker may report any name
+    name: Any = path.stem if path.suffix == ".py" else about.get("name")
     for key, value, limit in (("name", name, METHOD_NAME), ("title", about.get("title"), TITLE)):
         if not isinstance(value, str) or not limit.fullmatch(value) or sanitize(value) != value:
             raise ValueError(f"{path} reports an invalid {key}")

@@ -1,8 +1,10 @@
-"""Run methods on environments and seeds; the result of each episode is stored when it finishes."""
+"""Jobs: methods, environments and seeds, with their defaults. The result of each episode is stored
+when it finishes."""
 
 from __future__ import annotations
 
 import hashlib
+import itertools
 import json
 import platform
 import sys
@@ -17,12 +19,26 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 from tqdm import tqdm
 
+from eitbench import _check
 from eitbench._sanitize import error_location, user_traceback
-from eitbench.bench import isolation, methods
-from eitbench.bench.isolation import WorkerError
-from eitbench.bench.methods import Method
+from eitbench.bench import isolation, tracks
+from eitbench.bench.isolation import WorkerError, choose_isolation
+from eitbench.bench.methods import (
+    METHOD_KINDS,
+    Method,
+    builtin_agents,
+    builtin_methods,
+    find_method,
+    installed_methods,
+    is_path,
+    load_method,
+    loader_of,
+    method_files,
+    method_sha256,
+    version_of,
+)
 from eitbench.bench.records import COMMON_FIELDS
-from eitbench.bench.runner import cached_environment, run_method
+from eitbench.bench.runner import cached_environment, is_compatible, run_method
 from eitbench.bench.scores import SCORING, compute_scores
 from eitbench.bench.store import EpisodeStore, machine, portable_command, provenance
 from eitbench.bench.tracks import Environment, is_measured, registered_kwargs, subtrack_of
@@ -32,6 +48,9 @@ from eitbench.data.parallel import run_parallel
 from eitbench.data.seeds import format_seed
 from eitbench.measured.cases import read_case
 from eitbench.worlds.registry import entry
+
+TOO_SLOW_FOR_QUICK = {("filter", "gauss_newton"), ("filter", "total_variation")}
+"""Subtracks and methods that the quick suite skips: an episode takes minutes."""
 
 
 class Job(NamedTuple):
@@ -52,14 +71,14 @@ class Job(NamedTuple):
             return isolation.load_isolated(track, self.environment.id, self.environment.kwargs,
                                            self.method, self.isolation)
         with redirect_stdout(sys.stderr):
-            return methods.load_method(self.method, track)
+            return load_method(self.method, track)
 
     def identity(self) -> str:
         """Return a digest of the configuration and declared versions that determine the outcome; a
         stored result is reused only if the digests are equal. The method is not loaded.
         ``ValueError`` for an unknown method or environment."""
-        path = methods.find_method(self.method, self.environment.track)
-        contents = methods.method_files(path)
+        path = find_method(self.method, self.environment.track)
+        contents = method_files(path)
         files = {name: hashlib.sha256(content).hexdigest() for name, content in contents.items()
                  if name != "sha256"}
         id, arguments = self.environment.id, self.environment.arguments
@@ -67,9 +86,70 @@ class Job(NamedTuple):
         world = (read_case(registered_kwargs(id)["case"]).digest if is_measured(id)
                  else world_digest(entry(id).world.with_changes(changes)))
         parts = {"environment": id, "arguments": arguments, "world": world, "files": files,
-                 "loader": methods.loader_of(path), "seed": self.seed, "scoring": SCORING,
-                 "version": methods.version_of(path, methods.method_sha256(contents))}
+                 "loader": loader_of(path), "seed": self.seed, "scoring": SCORING,
+                 "version": version_of(path, method_sha256(contents))}
         return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()[:16]
+
+
+def make_jobs(track: str, environments: list[str], methods: list[str],
+              seeds: list[int] | None = None, *, suite: str = "full", estimator: str = "full",
+              isolate: str = "auto", strict: bool = False,
+              worlds: Sequence[dict[str, Any]] = ({},)) -> list[Job]:
+    """Return the jobs of each given method (default: all built-in methods and trained agents) in
+    each compatible environment, ordered by environment, method and seed.
+
+    The ``suite``, quick or full, determines the default environments and seeds. Each environment
+    has a variant for each of ``worlds`` (the argument ``world`` of `gymnasium.make`); injection
+    environments have the filter ``estimator``. ``isolate`` and ``strict`` are as in
+    `isolation.choose_isolation`. ``ValueError`` if an environment or method is unknown, a given
+    method is compatible with none of the environments, or two methods have the same name.
+    """
+    _check.choice("estimator", estimator, tracks.ONBOARD_FILTERS)
+    given = {} if estimator == "full" else {"estimator": estimator}
+    for method in methods:
+        find_method(method, track)
+    if not environments:
+        quick = track == "estimation" and suite == "quick"
+        environments = list(tracks.QUICK_IDS) if quick else tracks.ids(track)
+    todo = []
+    fitting = set[str]()
+    trained_in = dict[str, Any]()
+    for id, changes in itertools.product(environments, worlds):
+        tracks.check_track(id, track)
+        arguments = given | ({"world": changes} if changes else {})
+        asked = Environment(id, json.dumps(arguments))
+        # subtrack and rules are read with the filter of the shortest setup
+        fastest = {"estimator": "reduced"} if track == "injection" else {}
+        env = cached_environment(Environment(id, json.dumps(arguments | fastest)))
+        board = subtrack_of(env)
+        numbers = tracks.default_seeds(id, suite) if seeds is None else seeds
+        names = dict[str, str]()
+        # environment by environment: models are cached for a few only, and a worker serves one
+        # method
+        for method in methods or [*builtin_methods(track), *builtin_agents(id)]:
+            skipped = suite == "quick" and not methods and (board, method) in TOO_SLOW_FOR_QUICK
+            job = isolated_job(asked, method, isolate, strict)
+            loaded = job.load()
+            if (other := names.setdefault(loaded.name, method)) != method:
+                raise ValueError(f"{other} and {method} have the same name, under which results "
+                                 "are stored; rename one")
+            trained_in[method] = loaded.parameters.get("env")
+            if not skipped and is_compatible(loaded, env):
+                fitting.add(method)
+                todo += [job._replace(seed=seed) for seed in numbers]
+    if missing := [f"{method} (trained in {trained_in[method]})" if trained_in[method] else method
+                   for method in methods if method not in fitting]:
+        raise ValueError(f"{METHOD_KINDS[track].kind} {', '.join(missing)} suits none of the "
+                         f"environments {', '.join(environments)}; see `eitbench list`")
+    return todo
+
+
+def isolated_job(environment: Environment, method: str, isolate: str,
+                 strict: bool = False) -> Job:
+    """Return the job of a method, given by name or path; see `isolation.choose_isolation`."""
+    kind = choose_isolation(environment, method, isolate, strict=strict)
+    path = installed_methods().get(method, Path(method))
+    return Job(environment, str(path.absolute()) if is_path(str(path)) else method, 0, kind)
 
 
 def run_episode(job: Job) -> tuple[dict[str, Any], dict[str, np.ndarray]]:

@@ -6,9 +6,9 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
-from eitbench.bench import suites, tracks
+from eitbench.bench import tracks
 from eitbench.bench.records import read_record, split_of, write_record
-from eitbench.bench.run import Job, pending_jobs, run_jobs
+from eitbench.bench.run import Job, make_jobs, pending_jobs, run_jobs
 from eitbench.bench.store import EpisodeStore, provenance, record_results
 from eitbench.data.seeds import format_seed, seed_ranges
 
@@ -41,8 +41,8 @@ def submit(method: str | None, environments: list[str], seeds: list[int] | None,
     track = "injection" if policy else "estimation"
     known = {id: tracks.track_of(id) for id in environments or tracks.ids()}
     asked: Iterable[list[Job]] = (
-        suites.make_jobs(track if method else own, [id], [method] if method else [], seeds,
-                         isolate=isolate, strict=official) for id, own in known.items())
+        make_jobs(track if method else own, [id], [method] if method else [], seeds,
+                  isolate=isolate, strict=official) for id, own in known.items())
     if method is not None:
         asked = list(asked)
         for jobs in asked:

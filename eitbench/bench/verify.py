@@ -19,11 +19,10 @@ from eitbench.bench import records as stored
 from eitbench.bench.isolation import WorkerError
 from eitbench.bench.methods import is_builtin, method_files, method_sha256
 from eitbench.bench.records import read_valid_files, record_file_name, version_number
-from eitbench.bench.run import Job, run_jobs
+from eitbench.bench.run import Job, isolated_job, run_jobs
 from eitbench.bench.runner import run_method
 from eitbench.bench.scores import compute_scores, scores
 from eitbench.bench.store import EpisodeStore
-from eitbench.bench.suites import isolated_job
 from eitbench.bench.table import Cell, Table
 from eitbench.bench.text import scores_by_seed
 from eitbench.bench.tracks import Environment

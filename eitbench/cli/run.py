@@ -59,8 +59,7 @@ def run(
 
     Exit status 1 if all episodes of a method failed.
     """
-    from eitbench.bench import suites
-    from eitbench.bench.run import pending_jobs, run_jobs
+    from eitbench.bench.run import make_jobs, pending_jobs, run_jobs
     from eitbench.bench.store import EpisodeStore, folder_results
     from eitbench.bench.variants import variants
     with options.cli_errors():
@@ -68,9 +67,9 @@ def run(
         if records is not None and not records.is_dir():
             raise ValueError(f"--records must be a folder, got {records}")
         worlds = variants(settings or [])
-        todo = suites.make_jobs(track, env or [], (baseline or policy or []),
-                                options.parse_episodes(seeds), suite=suite, estimator=estimator,
-                                isolate=isolate, worlds=worlds)
+        todo = make_jobs(track, env or [], (baseline or policy or []),
+                         options.parse_episodes(seeds), suite=suite, estimator=estimator,
+                         isolate=isolate, worlds=worlds)
         before = folder_results(records) if records else []
         store = EpisodeStore(out)
         left = pending_jobs(todo, before) if before else todo

@@ -13,9 +13,8 @@ from matplotlib.lines import Line2D
 
 from eitbench._files import bundled_path
 from eitbench.bench.methods import baseline_folder
-from eitbench.bench.run import pending_jobs, run_jobs
+from eitbench.bench.run import make_jobs, pending_jobs, run_jobs
 from eitbench.bench.store import EpisodeStore, folder_results
-from eitbench.bench.suites import make_jobs
 from eitbench.bench.text import mean_and_interval
 from eitbench.data.seeds import format_seed
 from eitbench.report.animate import animate

@@ -83,19 +83,3 @@ def test_results_that_are_not_files_are_reported(played):
     (played / "dev-7.json").mkdir()
     with pytest.warns(UserWarning, match=r"dev-7\.json is left out"):
         assert len(list(EpisodeStore(played.parents[2]).results())) == 4
-
-
-def test_control_characters_of_an_exception_are_escaped(tmp_path, monkeypatch):
-    """Control characters in a method's title and message are escaped in the terminal, the table and the page."""
-    shorten(monkeypatch, FILTER.id)
-    monkeypatch.chdir(tmp_path)
-    write_baseline(tmp_path, "loud", doc="Loud *",
-                   update="raise ValueError('\\x1b[2J\\u202eall well\\nfailed: nothing')")
-    code, said, complaint = eitbench("run", "--baseline", "loud.py", "--env", FILTER.id, "--seeds", "dev:0", "-j", 1)
-    words = r"failed: loud in eitbench/Pipe2D-v0 on dev:0: ValueError: \x1b[2J\u202eall well\nfailed: nothing"
-    assert code == 1 and words in complaint
-    page = (tmp_path / "results" / "index.html").read_text()
-    table = (tmp_path / "results" / "leaderboard.md").read_text()
-    assert r"Loud \*" in table
-    for text in (said, complaint, page, table):
-        assert "\x1b" not in text and "\u202e" not in text

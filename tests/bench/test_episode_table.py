@@ -8,7 +8,7 @@ import pytest
 from eitbench._files import bundled_path
 from eitbench.bench import load
 from eitbench.bench.episode_table import TABLE_NAME, episode_table, read_episode_table, write_episode_table
-from eitbench.bench.records import read_records, split_outdated, write_record
+from eitbench.bench.records import read_record, read_records, split_outdated, write_record
 from eitbench.report import compare
 from eitbench.report.boards import anchors, bundled_anchors
 
@@ -20,8 +20,10 @@ RESULTS = bundled_path("leaderboards") / "results"
 def test_the_published_table_agrees_with_the_records():
     """`eitbench leaderboard --records leaderboards/results` would not change it, and `load` returns the same data."""
     text = lzma.decompress((RESULTS.parent / TABLE_NAME).read_bytes()).decode()
-    assert text == episode_table(read_records(RESULTS)), "run `eitbench leaderboard --records leaderboards/results`"
+    records = read_records(RESULTS)
+    assert text == episode_table(records), "run `eitbench leaderboard --records leaderboards/results`"
     pd.testing.assert_frame_equal(load(RESULTS.parent / "none"), load(), check_exact=True)
+    assert bundled_anchors(records) == anchors(records)
 
 
 def test_published_records_name_no_folder_of_a_machine():
@@ -51,20 +53,17 @@ def test_records_come_back(tmp_path):
                                   load(tmp_path / "json").sort_values(order, ignore_index=True), check_exact=True)
 
 
-def test_compare_and_skill_need_no_records(tmp_path, monkeypatch):
+def test_compare_needs_no_records(tmp_path, monkeypatch):
     """Methods are compared as in a checkout if only the table exists."""
-    folder = tmp_path / "results"
-    (tmp_path / TABLE_NAME).write_bytes((RESULTS.parent / TABLE_NAME).read_bytes())
-
-    def compared():
+    for name in ("homogeneous", "kalman_filter", "extended_kalman_filter"):
+        write_record(tmp_path / "json", read_record(RESULTS / f"eitbench-Pipe2D-v0--{name}--v1.json"))
+    write_episode_table(read_records(tmp_path / "json"), tmp_path / TABLE_NAME)
+    tables = []
+    for folder in ("json", "table"):
+        monkeypatch.setattr(compare, "BUNDLED_RECORDS", tmp_path / folder)
         pair = [compare.find_records(name, tmp_path / "mine") for name in ("kalman_filter", "extended_kalman_filter")]
-        return compare.compare(*pair, "error", compare.naive_baseline_records(tmp_path / "mine"))
-
-    here = compared()
-    monkeypatch.setattr(compare, "BUNDLED_RECORDS", folder)
-    pd.testing.assert_frame_equal(compared(), here)
-    records = read_records(RESULTS)
-    assert bundled_anchors(records) == anchors(records)
+        tables.append(compare.compare(*pair, "error", compare.naive_baseline_records(tmp_path / "mine")))
+    pd.testing.assert_frame_equal(*tables)
 
 
 @pytest.mark.parametrize("damage", [

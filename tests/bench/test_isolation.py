@@ -15,9 +15,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from eitbench.bench import isolation, suites
+from eitbench.bench import isolation
 from eitbench.bench.isolation import Limits, Worker, WorkerError, bubblewrap_problem, choose_isolation
-from eitbench.bench.run import Job, run_episode, run_jobs
+from eitbench.bench.run import Job, make_jobs, run_episode, run_jobs
 from eitbench.bench.store import EpisodeStore
 from eitbench.bench.tracks import Environment
 from eitbench.data.cache import CACHE_VARIABLE
@@ -164,7 +164,7 @@ def test_third_party_files_need_bubblewrap_where_strict(monkeypatch):
     with pytest.raises(ValueError, match="isolate must be bubblewrap or process"):
         choose_isolation(FILTER, "mine.py", "none", strict=True)
     with pytest.raises(ValueError, match="isolate must be one of auto, none, process, bubblewrap; got 'never'"):
-        suites.make_jobs("estimation", [FILTER.id], ["homogeneous"], [1], isolate="never")
+        make_jobs("estimation", [FILTER.id], ["homogeneous"], [1], isolate="never")
 
 
 def test_a_kernel_that_forbids_namespaces_is_recognised(monkeypatch, tmp_path):

@@ -51,7 +51,7 @@ def test_the_policy_has_the_same_random_stream_as_in_runs():
     from eitbench.bench.runner import iter_injections
     export_minari(NAME, ENV, "random_pair", "dev:3")
     (episode,) = minari.load_dataset(NAME).iterate_episodes()
-    env = gym.make(ENV, estimator="full", observation="raw").unwrapped
+    env = gym.make(ENV, observation="raw").unwrapped
     played = [observation["currents"] for _, observation, *_ in
               iter_injections(env, load_method("random_pair", "injection"), 100_003)]
     np.testing.assert_allclose(played, env.rules.currents(episode.actions))

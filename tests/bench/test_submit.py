@@ -3,7 +3,7 @@
 import re
 
 import pytest
-from eitbench.bench import load, methods, run, suites
+from eitbench.bench import load, methods, run
 from eitbench.bench.records import read_record, read_records, split_outdated, write_record
 from eitbench.bench.store import EpisodeStore, machine, provenance
 from eitbench.bench.submit import submit
@@ -43,7 +43,7 @@ def test_a_submission_is_a_record_per_environment(tmp_path):
 
 def test_all_built_in_methods_by_one_command(tmp_path, monkeypatch):
     """All compatible methods run, by environment: finished environments have records after an interruption."""
-    monkeypatch.setattr(suites, "builtin_methods", lambda track: ["persistence", "fixed_interval_smoother"])
+    monkeypatch.setattr(run, "builtin_methods", lambda track: ["persistence", "fixed_interval_smoother"])
     made = submit(None, [FILTER.id, SMOOTHING.id], TEST[:1], EpisodeStore(tmp_path / "r"), tmp_path / "to")
     assert "--persistence--" in next(made).name
     assert [path.name.split("--")[1] for path in (tmp_path / "to").iterdir()] == ["persistence"]

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 from eitbench import __version__
-from eitbench.bench import suites, tracks
+from eitbench.bench import run, tracks
 from eitbench.bench.methods import builtin_methods
 from eitbench.bench.tracks import ids
 from eitbench.cli.app import app
@@ -97,31 +97,31 @@ def test_every_subtrack_by_default(tmp_path):
 def test_suites():
     """full has every environment; quick the plain pipe with fewer seeds, without methods that take minutes. Methods
     fitted to a real pipe are incompatible with tiny worlds."""
-    quick, full = (suites.make_jobs("estimation", [], [], [1], suite=suite) for suite in ("quick", "full"))
+    quick, full = (run.make_jobs("estimation", [], [], [1], suite=suite) for suite in ("quick", "full"))
     plain = set(PLAIN) & set(ids("estimation"))
     assert {job.environment.id for job in quick} == plain and len(plain) == 3
     assert {job.environment.id for job in full} == set(ids("estimation"))
     real_only = {"approximation_error_filter", "identified_flow", "real_time_filter"}
     real_only |= {name for name in builtin_methods("estimation") if name.startswith("learned_")}
     missing = {job for job in full if job.environment.id in plain} - set(quick)
-    assert missing == {suites.Job(suites.Environment(PIPE), name, 1) for name in ("gauss_newton", "total_variation")}
+    assert missing == {run.Job(tracks.Environment(PIPE), name, 1) for name in ("gauss_newton", "total_variation")}
     assert set(quick) < set(full)
     assert {job.method for job in full} == set(builtin_methods("estimation")) - real_only
     assert set(parse_seeds(tracks.QUICK_SEEDS)) < set(parse_seeds(entry(PIPE).test_seeds))
     assert min(parse_seeds(entry(PIPE).test_seeds)) == 200_000
-    asked_for = suites.make_jobs("estimation", [PIPE], ["gauss_newton"], [1, 2], suite="quick")
+    asked_for = run.make_jobs("estimation", [PIPE], ["gauss_newton"], [1, 2], suite="quick")
     assert [job.seed for job in asked_for] == [1, 2]
 
 
 def test_agents_of_two_environments_may_have_one_name(tmp_path, monkeypatch):
     """Results are stored by environment and name: only two files of one environment must have different names."""
-    monkeypatch.setattr(suites, "builtin_methods", lambda track: [])
-    monkeypatch.setattr(suites, "builtin_agents", lambda id: [write_baseline(tmp_path / id)])
+    monkeypatch.setattr(run, "builtin_methods", lambda track: [])
+    monkeypatch.setattr(run, "builtin_agents", lambda id: [write_baseline(tmp_path / id)])
     pair = ids("estimation")[:2]
-    jobs = suites.make_jobs("estimation", pair, [], [1], isolate="none")
+    jobs = run.make_jobs("estimation", pair, [], [1], isolate="none")
     assert [job.environment.id for job in jobs] == pair
     with pytest.raises(ValueError, match="have the same name"):
-        suites.make_jobs("estimation", pair[:1], [job.method for job in jobs], [1], isolate="none")
+        run.make_jobs("estimation", pair[:1], [job.method for job in jobs], [1], isolate="none")
 
 
 # -- help -------------------------------------------------------------------------------------------------------------
