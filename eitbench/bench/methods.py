@@ -104,8 +104,12 @@ def baseline_folder() -> Path:
 
 def builtin_methods(track: str) -> list[str]:
     """Return the names of the built-in methods of a track, without agents."""
+    return list(_builtin_paths(track))
+
+
+def _builtin_paths(track: str) -> dict[str, Path]:
     folder = baseline_folder() / METHOD_KINDS[track].folder
-    return sorted(path.stem for path in folder.glob("*.py"))
+    return {path.stem: path for path in sorted(folder.glob("*.py"))}
 
 
 def builtin_agents(id: str) -> list[str]:
@@ -123,8 +127,7 @@ def builtin_agents(id: str) -> list[str]:
 def builtin_files(id: str) -> dict[str, Path]:
     """Map the names of results to the files of all built-in methods and of the agents of an
     environment; checkpoints of agents may be missing."""
-    folders = [baseline_folder() / form.folder for form in METHOD_KINDS.values()]
-    return ({path.stem: path for folder in folders for path in sorted(folder.glob("*.py"))}
+    return (_builtin_paths("estimation") | _builtin_paths("injection")
             | {f"{path.parents[1].name}_{path.parent.name}": path for path in _agents(id)})
 
 
@@ -276,18 +279,17 @@ def find_method(name: str, track: str) -> Path:
     """Return the file of a method by its name, if it is built in or installed, or by its path.
     ``ValueError`` if the file is missing, or has the name of another method."""
     form = METHOD_KINDS[track]
-    folder = baseline_folder() / form.folder
-    own = builtin_methods(track)
+    own = _builtin_paths(track)
     if is_path(name):
         path = resolve_input(Path(name))
     else:
-        known = installed_methods() | {each: folder / f"{each}.py" for each in own}
+        known = installed_methods() | own
         _check.choice(f"{form.kind}, if not the path of {form.files},", name, known)
         path = known[name]
     if not path.is_file():
         hint = f": {AGENTS_NOT_BUNDLED}" if "checkpoints" in path.parts else ""
         raise ValueError(f"{form.kind} {path} does not exist, or is not a file{hint}")
-    if path.stem in own and not path.samefile(folder / f"{path.stem}.py"):
+    if path.stem in own and not path.samefile(own[path.stem]):
         raise ValueError(f"{form.kind} {path} has the name of a built-in method, under which "
                          "results are stored; rename it")
     return path
