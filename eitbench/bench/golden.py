@@ -138,7 +138,7 @@ def update(names: list[str], *, new_version: bool = False) -> Iterator[tuple[str
 def _computed(name: str, expected: dict[str, Any] | None, is_quick: bool = False) -> dict[str, Any]:
     """Compute the content of a golden file, for a method with the episodes of the ``expected``."""
     if name in tracks.builtin_ids():
-        return rounded(world_golden(name, is_quick=is_quick))
+        return round_numbers(world_golden(name, is_quick=is_quick))
     method = golden_methods()[name]
     golden = expected or _new_golden(name, method)
     return golden | {"episodes": [_run_episode(episode, method) for episode in golden["episodes"]]}
@@ -221,10 +221,10 @@ def world_numbers(world: World, episodes: tuple[str, ...]) -> dict[str, Any]:
             "episodes": {name: _episode_numbers(world, name) for name in episodes}}
 
 
-def rounded(value: Any) -> Any:
+def round_numbers(value: Any) -> Any:
     """Return numbers and arrays, in nested dicts, as lists of numbers with ten digits."""
     if isinstance(value, dict):
-        return {name: rounded(inner) for name, inner in value.items()}
+        return {name: round_numbers(inner) for name, inner in value.items()}
     if isinstance(value, str):
         return value
     return [float(f"{number:.10g}") for number in np.ravel(value)]

@@ -118,15 +118,15 @@ def read_records(folder: Path) -> list[dict[str, Any]]:
     return list(records.values())
 
 
-def read_valid_files(folder: Path, *, measured: bool = False,
+def read_valid_files(folder: Path, *, measured: bool | None = False,
                      ) -> tuple[dict[Path, dict[str, Any]], list[str]]:
     """Return path -> record for the valid records of a folder, and an error message for each other
-    file; with ``measured`` only for records of measured cases, else only for others."""
+    file: of measured cases, of all others (False), or of both (None)."""
     valid = {}
     complaints = []
-    known = set(tracks.measured_ids() if measured else tracks.ids())
+    known = {*tracks.measured_ids(), *tracks.ids()}
     for path in sorted(Path(folder).glob("*.json")):
-        if path.name.startswith(tracks.MEASURED_FILES) != measured:
+        if measured not in (None, path.name.startswith(tracks.MEASURED_FILES)):
             continue
         try:
             record = read_record(path)

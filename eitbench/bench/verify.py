@@ -102,11 +102,8 @@ def select_records(folder: Path, environments: Sequence[str] = (), *, top: int =
     mean error, without naive baselines, oracles and failures. ``ValueError`` without such records,
     or naming all invalid files.
     """
-    read, complaints = read_valid_files(folder)
-    if environments:                        # else without measurements, whose files may be missing
-        measured, more = read_valid_files(folder, measured=True)
-        read |= measured
-        complaints += more
+    # without environments no measurements, whose files may be missing
+    read, complaints = read_valid_files(folder, measured=None if environments else False)
     if complaints:
         raise ValueError("; ".join(complaints))
     asked = [record for record in stored.split_outdated(list(read.values()))[0]
@@ -229,7 +226,7 @@ def _rerun_row(case: EpisodeCheck, store: EpisodeStore) -> dict[str, Any]:
 
 
 def _replay(k: int, record: dict[str, Any], episode: dict[str, Any]) -> tuple[int, dict[str, Any]]:
-    """Return ``k``, and the result of `replay_actions` or the reason why there is none."""
+    """Return ``k``, and the result of `replay_actions` or its error message."""
     try:
         return k, replay_actions(record, episode)
     except ValueError as error:

@@ -40,7 +40,7 @@ def test_shortened_episode_agrees_with_the_golden_file(name):
 @pytest.mark.parametrize("id", [id for id in BY_FLUID if "3D" in id])
 def test_first_observations_agree_with_the_golden_file(id):
     """For worlds in three dimensions these tests take seconds only."""
-    computed = golden.rounded(golden.first_observations(id, "train:0"))
+    computed = golden.round_numbers(golden.first_observations(id, "train:0"))
     assert not golden.differences(computed, golden.read_golden(id)["observations"]["train:0"])
 
 
@@ -81,7 +81,7 @@ def test_constant_off_by_a_thousandth_shows(id, part, name, shows, stays):
     """Only the numbers that depend on the constant change."""
     value = getattr(getattr(entry(id).world, part), name)
     world = entry(id).world.with_changes({part: {name: 1.001 * value}})
-    computed = golden.rounded(golden.world_numbers(world, ("train:0",)))
+    computed = golden.round_numbers(golden.world_numbers(world, ("train:0",)))
     expected = golden.read_golden(id)
     expected = {"model": expected["model"], "episodes": {"train:0": expected["episodes"]["train:0"]}}
     found = {line.split(" ")[0] for line in golden.differences(computed, expected)}
