@@ -116,14 +116,12 @@ def choose_isolation(environment: Environment, method: str, isolate: str = "auto
                          "(apt-get install bubblewrap), or accept a process that can read your "
                          "files with --isolate process")
     if kind == "process" and third_party:
-        _notify_of_process(method)
+        _notify_once(f"{method} runs in a separate process that can read your files; --isolate "
+                     "bubblewrap confines it, --isolate none runs it in this process")
     return kind
 
 
-@cache
-def _notify_of_process(method: str) -> None:
-    notify(f"{method} runs in a separate process that can read your files; --isolate bubblewrap "
-        "confines it, --isolate none runs it in this process")
+_notify_once = cache(notify)
 
 
 @cache
