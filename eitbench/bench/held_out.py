@@ -25,7 +25,7 @@ from eitbench.bench.records import read_record
 from eitbench.bench.run import Job, run_episode
 from eitbench.bench.text import scores_by_seed
 from eitbench.bench.tracks import NAIVE_BASELINES
-from eitbench.bench.verify import job_for_record, submitted_methods_folder
+from eitbench.bench.verify import job_for_record
 from eitbench.data.cache import use_cache_dir
 from eitbench.data.seeds import SPLITS, parse_seeds
 
@@ -74,7 +74,7 @@ def verify_all_held_out(paths: Sequence[Path], folder: Path, file: str | None, i
         for path in paths:
             try:
                 record = read_record(path)
-                job = job_for_record(record, file, isolate, submitted_methods_folder(path))
+                job = job_for_record(record, file, isolate, path)
                 row, found = verify_held_out(record, job, secret, episodes)
             except (ValueError, WorkerError) as error:
                 row, found = {}, [str(error)]

@@ -162,7 +162,8 @@ def record_name(environment: str, method: str, version: str, split: str) -> str:
 def subtrack_of(env: EstimationEnv | InjectionEnv) -> str:
     """Return the subtrack of an environment, one of its track's `SUBTRACKS`."""
     lag = getattr(env, "lag", None)
-    return "injection" if lag is None else _estimation_subtrack(lag, env.world.n_steps)
+    # an environment of measurements has no world
+    return "injection" if lag is None else _subtrack_of_lag(lag, getattr(env, "world", None))
 
 
 def subtrack_of_id(id: str, kwargs: Mapping[str, Any] = MappingProxyType({})) -> str:
@@ -175,11 +176,13 @@ def subtrack_of_id(id: str, kwargs: Mapping[str, Any] = MappingProxyType({})) ->
     from eitbench.envs.estimation import resolve_arguments
     changes = (kwargs.get(name) for name in ("world", "lag", "assume"))
     world, lag, _ = resolve_arguments(entry(id), *changes)
-    return _estimation_subtrack(lag, world.n_steps)
+    return _subtrack_of_lag(lag, world)
 
 
-def _estimation_subtrack(lag: int, n_steps: int) -> str:
-    return "filter" if lag == 0 else "smoothing" if lag == n_steps - 1 else "fixed-lag"
+def _subtrack_of_lag(lag: int, world: Any) -> str:
+    if lag == 0:
+        return "filter"
+    return "smoothing" if lag == world.n_steps - 1 else "fixed-lag"
 
 
 def category_of(id: str, board: str) -> str:

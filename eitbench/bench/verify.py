@@ -72,8 +72,7 @@ def verify(paths: Sequence[Path], folder: Path, *, file: str | None = None, isol
     for path in paths:
         try:
             record = stored.read_record(path)
-            job = None if replay else job_for_record(record, file, isolate,
-                                                     submitted_methods_folder(path))
+            job = None if replay else job_for_record(record, file, isolate, path)
             if job is not None:
                 job.load()
         except (ValueError, WorkerError) as error:
@@ -130,16 +129,12 @@ def _first(records: list[dict[str, Any]], count: int) -> list[dict[str, Any]]:
 # -- the method of a record ---------------------------------------------------------------------
 
 
-def submitted_methods_folder(path: Path) -> Path:
-    """Return the folder of submitted methods that belongs to a record's folder."""
-    return path.absolute().parents[1] / "methods"
-
-
 def job_for_record(record: dict[str, Any], file: str | None = None, isolate: str = "auto",
-                   submitted: Path | None = None) -> Job:
+                   record_path: Path | None = None) -> Job:
     """Return the job, with seed 0, that a record describes. The method is in ``file``; by default
     the built-in or installed one of that name, or the file with the record's sha256 in the folder
-    ``submitted``. ``ValueError`` if no file is found, or it does not match the record."""
+    ``methods`` next to the record's folder. ``ValueError`` if no file is found, or it does not
+    match the record."""
     environment = _environment(record)
     built_in = methods.builtin_files(environment.id).get(record["method"])
     known = built_in or methods.installed_methods().get(record["method"])
@@ -148,7 +143,7 @@ def job_for_record(record: dict[str, Any], file: str | None = None, isolate: str
     elif known:
         method = record["method"] if known.suffix == ".py" else str(known)
     else:
-        method = _submitted(record, submitted)
+        method = _submitted(record, record_path)
     path = methods.find_method(method, environment.track)
     if is_builtin(method) and not (built_in and path.samefile(built_in)):
         raise ValueError(f"{path} must be the method of the record, {record['method']}, got "
@@ -166,8 +161,9 @@ def _environment(record: dict[str, Any]) -> Environment:
     return Environment(environment["id"], json.dumps(environment["kwargs"]))
 
 
-def _submitted(record: dict[str, Any], folder: Path | None) -> str:
-    """Return the file in a folder or its subfolders that has the record's sha256."""
+def _submitted(record: dict[str, Any], record_path: Path | None) -> str:
+    """Return the submitted file, also from a subfolder, that has the record's sha256."""
+    folder = record_path.absolute().parents[1] / "methods" if record_path else None
     for path in sorted(folder.rglob("*")) if folder else []:
         if not methods.is_path(path.name) or not path.is_file() or path.is_symlink():
             continue
