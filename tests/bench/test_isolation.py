@@ -304,7 +304,7 @@ def test_failures_end_the_worker(statement, message, tmp_path):
 @confined
 @pytest.mark.parametrize(("child", "limits", "message"), [
     ("pass", Limits(threads=100), "ResourceLimitError: it started more than 100|RuntimeError: refused"),
-    ("kept = np.ones(2**25)", Limits(memory=3 << 30), "ResourceLimitError: it held more than 3072 MiB|MemoryError"),
+    ("kept = np.ones(2**25)", Limits(memory=2 << 30), "ResourceLimitError: it held more than 2048 MiB|MemoryError"),
 ], ids=["processes", "memory of all processes"])
 def test_limits_hold_for_all_its_processes(child, limits, message, tmp_path):
     """Processes are also counted by the parent, because the kernel does not count processes of root."""
