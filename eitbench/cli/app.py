@@ -170,13 +170,12 @@ def leaderboard(
             return print_report(out)
     from eitbench._files import write_atomically
     from eitbench.bench.episode_table import table_path, write_episode_table
-    from eitbench.bench.records import read_valid_files
     from eitbench.report.boards import read_leaderboard_records
     from eitbench.report.site import collect, render, render_site, write_site
     with options.cli_errors():
         found, complaints = read_leaderboard_records(records)
         out = records.parent
-        site = collect(found, out)
+        site = collect([record for record in found if record["split"] == "test"], out)
         complaints += site.measured.errors
         texts = render(site)
         write_site(out / "site", render_site(site))
@@ -184,7 +183,7 @@ def leaderboard(
         write_atomically(out / name, text.encode())
         options.echo(f"wrote {out / name}")
     options.echo(f"wrote {out / 'site' / 'index.html'}")
-    write_episode_table(read_valid_files(records)[0].values(), table_path(records))
+    write_episode_table(found, table_path(records))
     options.echo(f"wrote {table_path(records)}")
     for complaint in complaints:
         options.echo(f"left out: {complaint}", err=True)
@@ -239,27 +238,3 @@ def render(
         animate(env, [policy] if policy else baseline or ["kalman_filter"], seed, step, out,
                 every=every, isolate=isolate)
         options.echo(f"wrote {out}")
-
-
-REPLACED = {
-    "cards": "eitbench golden", "check": "eitbench verify RECORDS…",
-    "fit-model": "eitbench fit model", "fit-prior": "eitbench fit prior",
-    "policies": "eitbench run --env ID --policy NAME", "reproduce": "python studies/thesis NAME",
-    "season": "eitbench verify --top 3 --held-out 20 --secret FILE",
-    "submit-measured": "eitbench submit --env eitbench/Measured-CASE-v0"}
-"""Removed command -> replacement."""
-
-
-def report_removed(context: typer.Context) -> None:
-    """Print the replacement of a removed command."""
-    name = str(context.info_name)
-    options.echo(f"`eitbench {name}` was removed: use `{REPLACED[name]}`", err=True)
-    raise typer.Exit(2)
-
-
-for _name in REPLACED:
-    app.command(_name, hidden=True, add_help_option=False, context_settings={
-        "allow_extra_args": True, "ignore_unknown_options": True})(report_removed)
-
-if __name__ == "__main__":
-    app()

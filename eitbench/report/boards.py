@@ -455,19 +455,17 @@ def _aggregate(category: str, made: list[Leaderboard]) -> list[Leaderboard]:
 
 
 def read_leaderboard_records(folder: Path) -> tuple[list[dict[str, Any]], list[str]]:
-    """Return the records of a folder that boards show, and one message for each invalid record.
-    ``ValueError`` if the folder does not exist or holds no valid record of test seeds."""
-    if not folder.is_dir():
-        raise ValueError(f"records must be a folder that exists, got {folder}")
+    """Return the records of a folder, and one message for each that leaderboards leave out: invalid
+    ones, and those of other seeds than test. ``ValueError`` if no other record exists."""
     read, complaints = read_valid_files(folder)
-    complaints += [f"record {path} has {record['split']} seeds, and leaderboards are made of test "
-                   "seeds" for path, record in read.items() if record["split"] != "test"]
-    found = [record for record in read.values() if record["split"] == "test"]
-    if not found:
+    others = [f"record {path} has {record['split']} seeds, and leaderboards are made of test seeds"
+              for path, record in read.items() if record["split"] != "test"]
+    complaints += others
+    if len(others) == len(read):
         raise ValueError("; ".join([f"records must be a folder with records of test seeds, got "
                                     f"{folder}, which holds no valid record of test seeds",
                                     *complaints]))
-    return found, complaints
+    return list(read.values()), complaints
 
 
 # -- skill and cost --------------------------------------------------------------------------------

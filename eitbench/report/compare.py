@@ -17,7 +17,6 @@ from eitbench.bench.records import (
     read_record,
     read_records,
     split_outdated,
-    version_number,
 )
 from eitbench.bench.scores import Score, scores
 from eitbench.bench.statistics import (
@@ -40,16 +39,13 @@ BUNDLED_RECORDS = bundled_path("leaderboards") / "results"
 """Records of the package."""
 OWN_RECORDS = Path("results/records")
 """Records of `eitbench run`."""
-MIN_VERSION_PREFIX = 4
-"""Smallest number of leading sha256 digits that identify a version."""
 
 
 def find_records(name: str, folder: Path) -> list[dict[str, Any]]:
     """Return the record in the file NAME.json, or the records METHOD or METHOD@VERSION of the
     first of these that has any: a folder, the package, `OWN_RECORDS`. Without a version the current
-    official records are returned, or else the other current ones. A third-party version may be
-    shortened to four digits. The name of an agent without training seed, such as ppo, selects its
-    `mean_over_trainings`.
+    official records are returned, or else the other current ones. The name of an agent without
+    training seed, such as ppo, selects its `mean_over_trainings`.
 
     Raises
     ------
@@ -59,11 +55,6 @@ def find_records(name: str, folder: Path) -> list[dict[str, Any]]:
     if name.endswith(".json"):
         return [read_record(resolve_input(Path(name)))]
     method, _, version = name.partition("@")
-
-    def fits(own: str) -> bool:
-        shortened = version_number(own) is None and len(version) >= MIN_VERSION_PREFIX
-        return own == version or (shortened and own.startswith(version))
-
     known: set[str] = set()
     for place in dict.fromkeys(map(Path.resolve, (folder, BUNDLED_RECORDS, OWN_RECORDS))):
         there = read_records(place)
@@ -71,7 +62,7 @@ def find_records(name: str, folder: Path) -> list[dict[str, Any]]:
         if not version:
             there = split_outdated(there)[0]
         own = [record for record in there
-               if record["method"] == method and (not version or fits(record["version"]))]
+               if record["method"] == method and version in ("", record["version"])]
         if not version:
             own = [record for record in own if record["official"]] or own or mean_over_trainings(
                 [record for record in there if agent_name(record["method"]) == method])
