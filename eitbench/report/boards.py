@@ -87,6 +87,8 @@ class MethodRow(NamedTuple):
     skill_scores: dict[str, float] = {}  # noqa: RUF012 (never changed)
     """Seed -> skill score; empty without a naive baseline."""
     colour: int = 0
+    trainings: tuple[MethodRow, ...] = ()
+    """Training seeds of which this is the mean, the best first."""
 
     @property
     def label(self) -> str:

@@ -49,15 +49,7 @@ BADGES = {"floor": "naive baseline", "reference": "oracle"}
 # -- trainings -------------------------------------------------------------------------------------
 
 
-class AgentRow(NamedTuple):
-    """One method, or all trainings of an agent."""
-
-    row: MethodRow
-    parts: list[MethodRow]
-    """Trainings, the best first; empty unless there are several."""
-
-
-def group_by_agent(board: Leaderboard) -> list[AgentRow]:
+def group_by_agent(board: Leaderboard) -> list[MethodRow]:
     """Return the rows of a leaderboard in its order, training seeds of an agent grouped.
 
     Agents with at least two ranked training seeds become one row: the mean over these seeds, with
@@ -67,15 +59,15 @@ def group_by_agent(board: Leaderboard) -> list[AgentRow]:
     for row in board.rows:
         if not row.has_no_rank:
             groups.setdefault(row.agent, []).append(row)
-    together = [AgentRow(_agent_mean(board, rows), rows) for rows in groups.values()
-                if sum(row.is_ranked for row in rows) > 1]
-    grouped = {row.label for line in together for row in line.parts}
-    together += [AgentRow(row, []) for row in board.rows if row.label not in grouped]
-    return sorted(together, key=lambda line: line.row.place())
+    means = [_agent_mean(board, rows) for rows in groups.values()
+             if sum(row.is_ranked for row in rows) > 1]
+    grouped = {row.label for mean in means for row in mean.trainings}
+    return sorted(means + [row for row in board.rows if row.label not in grouped],
+                  key=MethodRow.place)
 
 
 def _agent_mean(board: Leaderboard, rows: list[MethodRow]) -> MethodRow:
-    """Return the line of an agent."""
+    """Return the mean of the trainings of an agent."""
     ranked = [row for row in rows if row.is_ranked]
     first, unfinished = ranked[0], len(rows) - len(ranked)
     frame = pd.DataFrame([row.cells for row in ranked])
@@ -85,7 +77,7 @@ def _agent_mean(board: Leaderboard, rows: list[MethodRow]) -> MethodRow:
     errors = mean_by_seed([episode_errors(row.record) for row in ranked])
     if errors:
         cells |= error_and_skill(errors, episode_errors(naive_baseline_record(board.records)))
-    return first._replace(record=None, cells=cells | {
+    return first._replace(record=None, trainings=tuple(rows), cells=cells | {
         "method": agent_name(first.cells["method"]),
         "note": f"{unfinished} of {len(rows)} unfinished" if unfinished else "",
         "title": re.sub(r" trained with seed \d+$", "", first.cells["title"]),
@@ -110,13 +102,13 @@ class ScoreAxes(NamedTuple):
         return cls({name: _axis_range(board.rows, name) for name in INTERVAL_HEADINGS},
                    {"error": zero, "gain": 0.0})
 
-    def cell(self, row: MethodRow, name: str, parts: Sequence[MethodRow] = ()) -> Cell:
+    def cell(self, row: MethodRow, name: str) -> Cell:
         """Return a score with its interval, drawn and as text, and the range of seeds."""
         value, low, high = row.interval(name)
         if math.isnan(value):
             return Cell(MISSING)
         text, _, interval = format_interval(value, low, high).partition(" ")
-        each = sorted(part.cells[name] for part in parts if part.is_ranked)
+        each = sorted(part.cells[name] for part in row.trainings if part.is_ranked)
         if each:
             spread = format_interval(value, each[0], each[-1]).partition(" ")[2].strip("()")
             interval += f"; seeds {spread or format_number(value)}"
@@ -124,9 +116,9 @@ class ScoreAxes(NamedTuple):
                                  each=each)
         return Cell(text, value, drawn, note=interval.strip())
 
-    def cells(self, row: MethodRow, parts: Sequence[MethodRow] = ()) -> dict[str, Cell]:
+    def cells(self, row: MethodRow) -> dict[str, Cell]:
         """Return heading -> cell of each score with an interval."""
-        return {heading: self.cell(row, name, parts) for name, heading in INTERVAL_HEADINGS.items()}
+        return {heading: self.cell(row, name) for name, heading in INTERVAL_HEADINGS.items()}
 
     def headers(self) -> dict[str, Markup]:
         """Return heading -> the axis of its column, as SVG."""
@@ -158,15 +150,14 @@ def _rank_cell(row: MethodRow, shared: Counter[int | None]) -> Cell:
     return Cell(f"{rank}", float(rank), note="tied" if shared[rank] > 1 else "")
 
 
-def method_cell(row: MethodRow, root: str, parts: Sequence[MethodRow] = (),
-                more: Iterable[str] = ()) -> Cell:
+def method_cell(row: MethodRow, root: str, more: Iterable[str] = ()) -> Cell:
     """Return title, name and badges of a method, linked to its page or with its training seeds;
     ``more`` are further badges."""
     title = row.cells["title"]
     badges = (*(BADGES.get(word, word) for word in row.badges), *more)
-    if parts:
-        return Cell(title, title.casefold(), note=f"mean of {len(parts)} training seeds",
-                    badges=badges)
+    if row.trainings:
+        return Cell(title, title.casefold(), badges=badges,
+                    note=f"mean of {len(row.trainings)} training seeds")
     return Cell(title, title.casefold(), note=row.label, badges=badges,
                 link=f"{root}methods/{quote(row.cells['method'])}.html")
 
@@ -189,29 +180,28 @@ def page_table(board: Leaderboard, root: str, *, compact: bool = False) -> Table
     axes = ScoreAxes.of(board)
     together = group_by_agent(board)
     outperformed = _beaten_oracles(together)
-    shared = Counter(line.row.cells["rank"] for line in together)
+    shared = Counter(row.cells["rank"] for row in together)
 
-    def cells(row: MethodRow, parts: Sequence[MethodRow] = ()) -> dict[str, Cell]:
+    def cells(row: MethodRow) -> dict[str, Cell]:
         more = [*outperformed.get(row.label, ()), *author_badges(row)]
-        return {"rank": _rank_cell(row, shared), "method": method_cell(row, root, parts, more),
-                **axes.cells(row, parts),
-                **_number_cells(row, INDEX_COLUMNS if compact else headings())}
+        return {"rank": _rank_cell(row, shared), "method": method_cell(row, root, more),
+                **axes.cells(row), **_number_cells(row, INDEX_COLUMNS if compact else headings())}
 
     def part(row: MethodRow) -> TableRow:
         own = cells(row)
         return TableRow([own[heading] for heading in made.headings], filter_flags(row))
 
-    made = Table.of((cells(*line) for line in together), label=board.title, keep=["rank"],
-                    flags=[filter_flags(line.row) for line in together])
-    return made._replace(rows=[row._replace(children=tuple(map(part, line.parts)))
-                               for row, line in zip(made.rows, together, strict=True)])
+    made = Table.of(map(cells, together), label=board.title, keep=["rank"],
+                    flags=list(map(filter_flags, together)))
+    return made._replace(rows=[line._replace(children=tuple(map(part, row.trainings)))
+                               for line, row in zip(made.rows, together, strict=True)])
 
 
-def _beaten_oracles(together: list[AgentRow]) -> dict[str, list[str]]:
+def _beaten_oracles(together: list[MethodRow]) -> dict[str, list[str]]:
     """Return label of an oracle -> a note that ranked methods have a smaller error."""
     found = {}
     before: list[str] = []
-    for row, _ in together:
+    for row in together:
         if row.is_ranked:
             before.append(row.cells["title"])
         elif before and "reference" in row.badges:
@@ -334,7 +324,7 @@ def cost_chart(board: Leaderboard) -> charts.Chart | None:
     None without data."""
     points = [charts.ParetoPoint(row.cells["title"], row.colour, row.cells["seconds_per_step"],
                            row.cells["error"], row.is_ranked)
-              for row, _ in group_by_agent(board)
+              for row in group_by_agent(board)
               if row.cells["error"] is not None and row.cells["seconds_per_step"]]
     if not points:
         return None

@@ -204,8 +204,8 @@ def test_the_line_of_an_agent_is_the_mean_of_its_trainings():
     """An agent has error, skill score, interval over episodes, and one rank; Markdown has each training seed."""
     board = board_of(agents(record("ppo_seed3", [*of(0.5)[:5], None])))
     placed = group_by_agent(board)
-    assert [line.row.cells["method"] for line in placed] == ["ppo", "between", "seer", "behind", "homogeneous"]
-    row, parts = placed[0]
+    assert [row.cells["method"] for row in placed] == ["ppo", "between", "seer", "behind", "homogeneous"]
+    row, parts = placed[0], placed[0].trainings
     assert [part.cells["method"] for part in parts] == ["ppo_seed2", "ppo_seed0", "ppo_seed1", "ppo_seed3"]
     mean = np.mean(list(SEEDS.values()))
     assert row.cells["error"] == pytest.approx(mean * LEVEL.mean()) and row.badges == ("1 of 4 unfinished",)
@@ -213,7 +213,7 @@ def test_the_line_of_an_agent_is_the_mean_of_its_trainings():
     same = next(row for row in board_of([*agents(), record("same", of(mean))]).rows if row.cells["method"] == "same")
     for end in ("error_low", "error_high"):
         assert row.cells[end] == pytest.approx(same.cells[end])
-    assert [line.row.cells["rank"] for line in placed] == [1, 1, None, 3, None]  # the trainings count as one
+    assert [row.cells["rank"] for row in placed] == [1, 1, None, 3, None]  # the trainings count as one
     assert {part.cells["rank"] for part in parts[:3]} == {1}
     first = page_table(board, "").rows[0]
     assert first.cells[0].text == "1" and first.cells[1].note == "mean of 4 training seeds"
@@ -230,7 +230,7 @@ def test_the_line_of_an_agent_is_the_mean_of_its_trainings():
 def test_grouped_trainings(records, expected):
     """Records of one agent by the same submitter form a group if two have a rank."""
     board = board_of([record("homogeneous", list(LEVEL), **FLOOR), *records])
-    assert sorted(line.row.cells["method"] for line in group_by_agent(board)) == sorted([*expected, "homogeneous"])
+    assert sorted(row.cells["method"] for row in group_by_agent(board)) == sorted([*expected, "homogeneous"])
 
 
 def test_an_outperformed_reference_is_marked():

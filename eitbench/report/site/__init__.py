@@ -249,12 +249,12 @@ def headline(site: Site) -> Headline | None:
 
 def key_figures(site: Site) -> list[KeyFigure]:
     """Return up to two: skill scores of the best filter and of the best trained agent."""
-    def best(board: Leaderboard | None, *, trained: bool | None = None) -> tables.AgentRow | None:
-        return next((line for line in (tables.group_by_agent(board) if board else ())
-                     if line.row.is_ranked and trained in (None, bool(line.parts))), None)
+    def best(board: Leaderboard | None, *, trained: bool | None = None) -> MethodRow | None:
+        return next((row for row in (tables.group_by_agent(board) if board else ())
+                     if row.is_ranked and trained in (None, bool(row.trainings))), None)
 
-    def percent(line: tables.AgentRow) -> str:
-        return f"{100 * line.row.cells['gain']:.0f} %"
+    def percent(row: MethodRow) -> str:
+        return f"{100 * row.cells['gain']:.0f} %"
 
     found = []
     board = site.board("filter", ALL)
@@ -262,14 +262,14 @@ def key_figures(site: Site) -> list[KeyFigure]:
         count = sum(each.category == "filter" and each.environment in aggregate_environments()
                     for each in site.boards)
         found.append(KeyFigure(percent(first), "less error than the naive baseline with the best "
-                               f"filter ({first.row.cells['title']}), over {count} environments",
+                               f"filter ({first.cells['title']}), over {count} environments",
                                board))
     board = site.board("injection", AGENT_ENVIRONMENT)
     agent, rule = best(board, trained=True), best(board, trained=False)
     if board and agent and rule:
         found.append(KeyFigure(
             percent(agent), "less error than random pairs with an agent trained to choose when "
-            f"and where to inject ({agent.row.cells['title']}, mean of {len(agent.parts)} "
+            f"and where to inject ({agent.cells['title']}, mean of {len(agent.trainings)} "
             f"training seeds, on {board.title}); {percent(rule)} with the best rule-based policy",
             board))
     return found

@@ -70,7 +70,7 @@ class ShiftFamily(NamedTuple):
             gains = {name: row.cells["gain"] for name, row in own.items()
                      if row.complete and row.cells["gain"] is not None}
             row = home or next(iter(own.values()))
-            cells: dict[str, Cell | str] = {"method": method_cell(row, "", more=author_badges(row)),
+            cells: dict[str, Cell | str] = {"method": method_cell(row, "", author_badges(row)),
                                             "nominal": _error_cell(home)}
             cells |= {name: _error_cell(own.get(name), home, floors[name]) for name in self.shifts}
             least = min(gains, key=gains.__getitem__) if gains.keys() == shifted.keys() else ""
