@@ -5,7 +5,7 @@ from __future__ import annotations
 import base64
 import io
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from functools import lru_cache
 from typing import Any
 from urllib.parse import quote
@@ -25,6 +25,10 @@ ICON = f"data:image/svg+xml,{quote(_DRAWING, safe='')}"
 """Icon of the browser's tab: a pipe with a slug."""
 
 
+N_COLOURS = 12
+"""--c0 … --c11 of the style sheet; further series repeat them, dashed."""
+
+
 def render_template(name: str, /, **contents: Any) -> bytes:
     """Return the page that one of the templates in this folder makes of its contents."""
     return _environment().get_template(name).render(**contents).encode()
@@ -35,8 +39,21 @@ def _environment() -> jinja2.Environment:
     made = jinja2.Environment(loader=jinja2.PackageLoader("eitbench.report", "."), autoescape=True,
                               trim_blocks=True, lstrip_blocks=True, keep_trailing_newline=True,
                               undefined=jinja2.StrictUndefined, finalize=_finalize)
-    made.globals |= {"add_line_breaks": add_line_breaks, "icon": ICON}
+    made.globals |= {"add_line_breaks": add_line_breaks, "icon": ICON, "n_colours": N_COLOURS}
+    made.filters["tick"] = format_tick
     return made
+
+
+def macro(name: str) -> Callable[..., Markup]:
+    """Return a macro of the template of charts."""
+    drawing = _environment().get_template("charts.svg.j2").module
+    found: Callable[..., Markup] = getattr(drawing, name)
+    return found
+
+
+def format_tick(tick: float) -> str:
+    """``200,000`` and ``0.002``, never ``2e+05``."""
+    return f"{tick:,.0f}" if abs(tick) >= 1e4 else f"{tick:g}"
 
 
 def _finalize(value: Any) -> Any:

@@ -13,7 +13,6 @@ from eitbench.bench.records import read_records
 from eitbench.bench.table import MISSING
 from eitbench.bench.text import format_interval, format_number
 from eitbench.bench.tracks import ids
-from eitbench.report import charts
 from eitbench.report.site import (
     HEADLINE,
     LINKS,
@@ -29,7 +28,7 @@ from eitbench.report.site import (
 )
 from eitbench.report.site.robustness import shift_families, shift_heading
 from eitbench.report.tables import BADGES, group_by_agent, markdown_table, page_table
-from eitbench.report.templates import markdown
+from eitbench.report.templates import N_COLOURS, markdown
 from pages import Page, text_of
 
 from tables import said
@@ -380,7 +379,7 @@ def test_contrast(scheme):
     """Text 4.5 to 1 and lines of charts 3 to 1 (WCAG AA), on paper and on cards."""
     colours = {name: pair[scheme] for name, *pair in re.findall(
         r"--(\w+): light-dark\((#\w{6}), (#\w{6})\)", (PACKAGE / "report" / "style.css").read_text())}
-    assert colours.keys() >= {"paper", "card", "ink", "soft", "accent", *(f"c{k}" for k in range(charts.N_COLOURS))}
+    assert colours.keys() >= {"paper", "card", "ink", "soft", "accent", *(f"c{k}" for k in range(N_COLOURS))}
     for ground in ("paper", "card"):
         for name, colour in colours.items():
             least = 4.5 if name in ("ink", "soft", "accent", "c8") else 3.0 if re.fullmatch(r"c\d+", name) else 0.0
