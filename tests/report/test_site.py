@@ -297,11 +297,10 @@ def headlined(errors, official=True, **changes):
 
 def test_the_headline_is_computed():
     """The ratio of 37 and 4 is nine; key figures are skill scores of the best filter, trained agent and rule."""
-    found = headline(collect(headlined(ERRORS)))
-    assert found.text == "A flow model reduces the error ninefold" and found.figure.value == "5.0 ×"
-    for expected in ("0.037", "0.0040", "9.2 times less", "3.0 times less in its square root", "0.020",
-                     "test:0-1 of Pipe2"):
-        assert expected in found.measured, expected
+    found = text_of(rendered(headlined(ERRORS))["index.html"])
+    for expected in ("A flow model reduces the error ninefold", "5.0 ×", "error of 0.037", "flow model 0.0040",
+                     "9.2 times less", "3.0 times less in its square root", "image has 0.020", "test:0-1 of Pipe2"):
+        assert expected in found, expected
     policies = {"ppo_seed0": 0.5, "ppo_seed1": 0.7, "rule": 0.8, "random_pair": 1.0}
     filters, trained = key_figures(collect([
         *headlined(ERRORS), *headlined(ERRORS, id="eitbench/RotatingTank2D-v0"),
