@@ -60,13 +60,18 @@ class Chart(NamedTuple):
 
 
 class Axis:
-    """Map from values to px, logarithmic or linear, with ticks at round numbers."""
+    """Map from values to px, logarithmic or linear, with ticks at round numbers.
 
-    def __init__(self, low: float, high: float, begin: float, end: float, *, log: bool) -> None:
+    As HTML it is drawn for a column of `sparkline`s, with a line at ``mark``.
+    """
+
+    def __init__(self, low: float, high: float, begin: float, end: float, *, log: bool,
+                 mark: float | None = None) -> None:
         if high - low <= 1e-12 * max(abs(low), abs(high)):                 # a single value
             low, high = (low / 2, low * 2) if log else (low, low + max(1.0, abs(low)))
         self.low, self.high = low, high
         self.begin, self.end, self.log = begin, end, log
+        self.mark = mark if mark is not None and self.low <= mark <= self.high else None
 
     def __call__(self, value: float) -> float:
         value = max(value, self.low)
@@ -90,9 +95,15 @@ class Axis:
         first, last = math.ceil(self.low / step - 1e-9), math.floor(self.high / step + 1e-9)
         return [round(i * step, 12) for i in range(first, last + 1)]
 
+    def __html__(self) -> str:
+        """Return the drawn axis, with a number at its first and its last tick."""
+        ticks = self.ticks()
+        far = len(ticks) > 1 and self(ticks[-1]) - self(ticks[0]) > 0.5 * CELL_WIDTH_PX
+        return macro("sparkline_axis")(CELL_WIDTH_PX, self, ticks, [*ticks[:1] * far, *ticks[-1:]])
+
 
 def line_chart(x: np.ndarray, series: Sequence[Series], x_label: str, y_label: str, *,
-               log: bool = False) -> Markup:
+               log: bool = False) -> Chart:
     """Draw curves over a linear or logarithmic x axis and a logarithmic y axis; a series may end
     before ``x``, and NaN are left out."""
     values = np.concatenate([s.values for s in series])
@@ -101,12 +112,14 @@ def line_chart(x: np.ndarray, series: Sequence[Series], x_label: str, y_label: s
     py = Axis(least, max(np.nanmax(values), least) * 1.15, BOTTOM, TOP, log=True)
     curves = [(s, [(px(a), py(b)) for a, b in zip(x, s.values, strict=False) if b == b])
               for s in sorted(series, key=lambda s: not s.faint)]
-    return macro("line_chart")(BOX, px, py, x_label, y_label, curves)
+    shown = [s for s in series if not s.faint]
+    return Chart(macro("line_chart")(BOX, px, py, x_label, y_label, curves), _legend(shown),
+                 " Thin lines: all other methods." if len(shown) < len(series) else "")
 
 
-def pareto_chart(points: Sequence[ParetoPoint], x_label: str, y_label: str) -> Markup:
+def pareto_chart(points: Sequence[ParetoPoint], x_label: str, y_label: str) -> Chart:
     """Draw marks over two logarithmic axes, where small is good; `pareto_front` ones are filled and
-    joined. Names are written next to their marks where they fit."""
+    joined, and the note names them. Names are written next to their marks where they fit."""
     def axis(values: list[float], begin: float, end: float) -> Axis:
         positive = [value for value in values if value > 0] or [1.0]  # a zero is at the edge
         return Axis(min(positive) / 1.4, max(positive) * 1.4, begin, end, log=True)
@@ -123,8 +136,9 @@ def pareto_chart(points: Sequence[ParetoPoint], x_label: str, y_label: str) -> M
         name = truncate(p.name, MAX_POINT_LABEL_CHARS)
         place = _free_position(px(p.x), py(p.y), CHAR_WIDTH * len(name), taken)
         marks.append((p, p in best, name, place))
-    return macro("pareto_chart")(BOX, px, py, x_label, y_label, marks,
-                                 [(px(p.x), py(p.y)) for p in best])
+    svg = macro("pareto_chart")(BOX, px, py, x_label, y_label, marks,
+                                [(px(p.x), py(p.y)) for p in best])
+    return Chart(svg, _legend(points), f": {', '.join(p.name for p in best)}" if best else "")
 
 
 def pareto_front(points: Iterable[ParetoPoint]) -> list[ParetoPoint]:
@@ -136,26 +150,16 @@ def pareto_front(points: Iterable[ParetoPoint]) -> list[ParetoPoint]:
     return best
 
 
-def legend(series: Iterable[Series | ParetoPoint]) -> list[tuple[int, bool, str]]:
-    """Return the legend of series or points."""
+def _legend(series: Iterable[Series | ParetoPoint]) -> list[tuple[int, bool, str]]:
     return [(s.colour % N_COLOURS, s.colour >= N_COLOURS, s.name) for s in series]
 
 
-def sparkline(three: tuple[float, float, float], px: Axis, *, mark: float | None = None,
-              each: Iterable[float] = ()) -> Markup:
-    """Draw a dot and its interval for a table's cell, on the axis of its column, with a line at
-    ``mark`` and a stroke for ``each`` value of a mean. Hidden from screen readers: the adjacent
+def sparkline(three: tuple[float, float, float], px: Axis, each: Iterable[float] = ()) -> Markup:
+    """Draw a dot and its interval for a table's cell, on the axis of its column, with a line at the
+    axis' mark and a stroke for ``each`` value of a mean. Hidden from screen readers: the adjacent
     number has the same content."""
     ends = (min(end if math.isfinite(end) else three[0], px.high) for end in three)
-    return macro("sparkline")(CELL_WIDTH_PX, px, mark, *ends, [min(one, px.high) for one in each])
-
-
-def sparkline_axis(px: Axis, *, mark: float | None = None) -> Markup:
-    """Draw the axis of a column of `sparkline`s, with a number at its first and its last tick."""
-    ticks = px.ticks()
-    far = len(ticks) > 1 and px(ticks[-1]) - px(ticks[0]) > 0.5 * CELL_WIDTH_PX
-    return macro("sparkline_axis")(CELL_WIDTH_PX, px, mark, ticks,
-                                   [*ticks[:1] * far, *ticks[-1:]])
+    return macro("sparkline")(CELL_WIDTH_PX, px, *ends, [min(one, px.high) for one in each])
 
 
 def truncate(name: str, letters: int) -> str:

@@ -38,6 +38,7 @@ from eitbench.report.boards import (
     leaderboards,
     reference_environments,
 )
+from eitbench.report.charts import Axis
 from eitbench.report.site import measured, robustness
 from eitbench.report.templates import markdown, markdown_list, render_template
 
@@ -206,7 +207,7 @@ def index_page(site: Site) -> bytes:
     """Return the HTML of ``index.html``."""
     apart = reference_environments()
     shown = {name: [(board, tables.page_table(board, "", compact=True),
-                     tables.ScoreAxes.of(board).headers()) for board in boards
+                     tables.score_axes(board)) for board in boards
                     if board.environment not in apart]
              for name, boards in site.classes.items()}
     references = {name: [board for board in boards if board.environment in apart]
@@ -276,7 +277,7 @@ def environment_page(site: Site, board: Leaderboard) -> bytes:
     animation = f"{board.environment}.webp"
     return site.page(
         "environment", "../", board=board, id=id, description=description, details=details,
-        table=table, axes=tables.ScoreAxes.of(board).headers(),
+        table=table, axes=tables.score_axes(board),
         explanations=tables.explanations([table]),
         front=tables.cost_chart(board), curves=tables.curve_chart(board),
         moving=site.picture(animation, "../"),
@@ -316,9 +317,10 @@ def method_page(site: Site, name: str) -> bytes:
         versions=[_version(own, addresses) for own in versions.values()])
 
 
-def _placements(placements: list[tuple[Leaderboard, MethodRow]]) -> tuple[Table, dict[str, Markup]]:
+def _placements(placements: list[tuple[Leaderboard, MethodRow]]) -> tuple[Table, dict[str, Axis]]:
     """Return one row for each board, and the axes of skill scores that all rows share."""
-    gains = tables.ScoreAxes.of(Leaderboard("", ALL, "", [row for _, row in placements]))
+    every = Leaderboard("", ALL, "", [row for _, row in placements])
+    gains = tables.score_axes(every)["skill score"]
     rows = []
     for board, row in placements:
         rank = row.cells["rank"]
@@ -328,11 +330,11 @@ def _placements(placements: list[tuple[Leaderboard, MethodRow]]) -> tuple[Table,
                           note=f"{board.category} · {row.cells['version']}", badges=row.badges),
             "rank": Cell(MISSING) if rank is None else Cell(
                 str(rank), float(rank), note=f"of {sum(each.is_ranked for each in board.rows)}"),
-            "ẽ_c": tables.ScoreAxes.of(board).cell(row, "error"),
-            "skill score": gains.cell(row, "gain"),
+            "ẽ_c": tables.interval_cell(row, "error", tables.score_axes(board)["ẽ_c"]),
+            "skill score": tables.interval_cell(row, "gain", gains),
             "ms/step": number_cell(row.cells["seconds_per_step"])})
     table = Table.of(rows, label="Results", keep=list(rows[0]) if rows else ())
-    return table, {"skill score": gains.headers()["skill score"]}
+    return table, {"skill score": gains}
 
 
 def _version(records: list[dict[str, Any]], addresses: dict[tuple[str, str], str],
