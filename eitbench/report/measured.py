@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import ListedColormap
@@ -153,16 +154,18 @@ def _segmentations(env: MeasuredEnv, runs: Sequence[MeasuredRun], truth: np.ndar
 
 def _over_time(env: MeasuredEnv, runs: Sequence[MeasuredRun]) -> str:
     """Withheld residuals and NIS of each method, if there are any, as a data URI; else empty."""
-    frame = max(env.task.warm_up, 1)
-    curves = {"withheld residual / noise std": {
-        run.method: np.sqrt(_frame_means(run.withheld_residual_rms**2, frame)) for run in runs},
-        "NIS/m": {run.method: _frame_means(run.nis, frame) for run in runs}}
-    shown = [(label, own) for label, own in curves.items() if np.isfinite([*own.values()]).any()]
+    residuals = pd.DataFrame({run.method: run.withheld_residual_rms**2 for run in runs})
+    nis = pd.DataFrame({run.method: run.nis for run in runs})
+    residuals, nis = (each.rolling(max(env.task.warm_up, 1), center=True, min_periods=1).mean()
+                      for each in (residuals, nis))
+    shown = [(label, curves) for label, curves in (
+        ("withheld residual / noise std", np.sqrt(residuals)), ("NIS/m", nis))
+        if curves.notna().to_numpy().any()]
     if not shown:
         return ""
     figure, axes = _panels(len(shown), (10.5, 3.4))
-    for ax, (label, own) in zip(axes, shown, strict=True):
-        _plot(ax, env, own, label)
+    for ax, (label, curves) in zip(axes, shown, strict=True):
+        _plot(ax, env, curves, label)
         ax.axhline(1.0, color="0.7", linewidth=1)
         ax.set_yscale("log")
         ax.set_ylim(bottom=max(ax.get_ylim()[0], MIN_PLOTTED))
@@ -175,25 +178,17 @@ def _velocity(env: MeasuredEnv, runs: Sequence[MeasuredRun]) -> str:
     if env.task.velocity is None:
         return ""
     figure, (axes,) = _panels(1, (10.5, 2.8))
-    _plot(axes, env, {run.method: run.velocity[:, 0] for run in runs if run.velocity is not None},
-          "mean velocity / (m/s)")
+    _plot(axes, env, pd.DataFrame({run.method: run.velocity[:, 0] for run in runs
+                                   if run.velocity is not None}), "mean velocity / (m/s)")
     axes.legend(frameon=False, fontsize=9)
     return _figure(figure)
 
 
-def _plot(axes: Axes, env: MeasuredEnv, curves: dict[str, np.ndarray], label: str) -> None:
-    """Draw values (T,) of each method over time."""
+def _plot(axes: Axes, env: MeasuredEnv, curves: pd.DataFrame, label: str) -> None:
+    """Draw a column (T,) for each method over time."""
     for (method, values), colour in zip(curves.items(), cycle(LINE_COLOURS), strict=False):
         axes.plot(env.measurements.times, values, color=colour, label=method)
     axes.set(xlabel="time / s", ylabel=label)
-
-
-def _frame_means(values: np.ndarray, frame: int) -> np.ndarray:
-    """Moving averages over a frame of the finite values."""
-    known = np.isfinite(values)
-    weights = np.convolve(known.astype(float), np.ones(frame), "same")
-    total = np.convolve(np.where(known, values, 0.0), np.ones(frame), "same")
-    return np.where(weights > 0, total / np.maximum(weights, 1.0), np.nan)
 
 
 def _fit(env: MeasuredEnv) -> Figure:
