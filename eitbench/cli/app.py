@@ -80,9 +80,7 @@ def submit(
     env: options.Environments = None,
     baseline: Annotated[str | None, typer.Option(
         help="Built-in estimator name, or path of a .py file.")] = None,
-    policy: Annotated[str | None, typer.Option(
-        help="Built-in injection policy name, or path of a .py file or of an agent's model.zip. "
-             "Default: all built-in methods, in all environments.")] = None,
+    policy: options.Policy = None,
     seeds: Annotated[str | None, typer.Option(
         help="Episode seeds, e.g. test:0-9. Default: all seeds of the leaderboards.")] = None,
     official: Annotated[bool, typer.Option(
@@ -93,8 +91,8 @@ def submit(
     out: options.Out = Path("results"),
     to: Annotated[Path, typer.Option(help="Folder of the records.")] = options.RECORDS,
 ) -> None:
-    """Run the test episodes with one estimator or policy, or all built-in ones, and write records
-    for the leaderboards.
+    """Run the test episodes with one estimator or policy, by default with all built-in ones, and
+    write records for the leaderboards.
 
     Each episode is stored in OUT when it finishes; the same command resumes an interrupted run.
     """
@@ -218,9 +216,7 @@ def render(
     env: options.EnvironmentId = "eitbench/Pipe2D-v0",
     baseline: Annotated[list[str] | None, typer.Option(
         help="Estimator name or path; may be repeated. Default: kalman_filter.")] = None,
-    policy: Annotated[str | None, typer.Option(
-        help="Built-in injection policy name, or path of a .py file or of an agent's model.zip; "
-             "for injection environments.")] = None,
+    policy: options.Policy = None,
     seed: Annotated[str, typer.Option(help="Episode seed, e.g. dev:0.")] = "dev:0",
     step: Annotated[int | None, typer.Option(help="Only this state t, as a PNG.")] = None,
     every: Annotated[int, typer.Option(min=1, help="Draw every Nth state.")] = 1,

@@ -195,7 +195,7 @@ def headings(*, measured: bool = False) -> dict[str, str]:
 
 def column_descriptions(*, measured: bool = False) -> dict[str, str]:
     """Return heading -> explanation."""
-    return {"rank": _RANK} | dict(columns(measured=measured).values())
+    return {"rank": _RANK, **dict(columns(measured=measured).values())}
 
 
 def csv_fields() -> list[str]:
