@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 from markupsafe import Markup
 
 from eitbench._files import PACKAGE, replace_folder
-from eitbench._sanitize import escape_csv, escape_markdown
+from eitbench._sanitize import escape_csv
 from eitbench.bench.methods import baseline_folder, builtin_files, builtin_sha256, version_of
 from eitbench.bench.records import finished_at, group_runs, record_file_name, split_outdated
 from eitbench.bench.scores import scores
@@ -40,7 +40,7 @@ from eitbench.report.boards import (
 )
 from eitbench.report.charts import Axis
 from eitbench.report.site import measured, robustness
-from eitbench.report.templates import markdown, markdown_list, render_template
+from eitbench.report.templates import markdown, render_template
 
 CATEGORY_TEXTS = {
     "filter": "Each state is estimated from the measurements until then (filtering).",
@@ -141,32 +141,23 @@ def render(site: Site) -> dict[str, str]:
     """Return the content of ``leaderboard.csv``, with the names and SI units of
     `eitbench.bench.load`, and of ``leaderboard.md``, by file name; records of measurement files are
     in the second only."""
-    parts = ["# Leaderboards", "*Rendered from the records by `eitbench leaderboard --records "
-             "leaderboards/results`; [README.md](README.md) explains how to add one.*",
-             "The test episodes are public: every user can simulate them." if site.boards
-             else "No records yet."]
-    for name, boards in site.classes.items():
-        parts.append(f"## {name}")
-        for board in boards:
-            seeds = f", {board.seeds}" if board.seeds else ""
-            parts += [f"### {escape_markdown(board.title)}{seeds}",
-                      tables.markdown_table(board).markdown()]
-    parts += [*robustness.markdown_section(site.boards), *measured.markdown_section(site.measured)]
-    if site.boards:
-        parts += ["## Column descriptions", markdown_list(column_descriptions())]
-    if outdated := split_outdated(site.records)[1]:
-        parts += ["## Superseded records", "From an earlier version of the method.\n\n"
-                  + "\n".join(f"- {escape_markdown(record_file_name(record))}"
-                              for record in outdated)]
+    text = render_template(
+        "site/leaderboard.md.j2", families=robustness.shift_families(site.boards),
+        robustness_columns=robustness.ROBUSTNESS_COLUMNS, measured=site.measured,
+        measured_columns=measured.MEASURED_COLUMNS, columns=column_descriptions(),
+        classes={name: [(board, tables.markdown_table(board)) for board in boards]
+                 for name, boards in site.classes.items()},
+        superseded=list(map(record_file_name, split_outdated(site.records)[1])))
     table = leaderboard_table(site.boards).replace({"environment": {
         record["environment"]["name"]: qualified_name(record["environment"])
         for record in site.records}})
     for name, score in scores().items():
         table[name] /= score.factor
     table["peak_memory"] /= 1e-6
-    texts = {name: table[name].map(escape_csv) for name in ("environment", "method", "title")}
-    plain = table.assign(**texts).to_csv(index=False, float_format="%.6g", lineterminator="\n")
-    return {"leaderboard.csv": plain, "leaderboard.md": "\n\n".join(parts) + "\n"}
+    names = ["environment", "method", "title"]
+    table[names] = table[names].map(escape_csv)
+    return {"leaderboard.csv": table.to_csv(index=False, float_format="%.6g", lineterminator="\n"),
+            "leaderboard.md": text.decode()}
 
 
 def write_site(folder: Path, files: Mapping[str, bytes]) -> None:
@@ -182,14 +173,6 @@ def write_site(folder: Path, files: Mapping[str, bytes]) -> None:
 
 
 # -- index -----------------------------------------------------------------------------------------
-
-
-class KeyFigure(NamedTuple):
-    """One of the numbers below the headline."""
-
-    value: str
-    about: str
-    board: Leaderboard
 
 
 class Headline(NamedTuple):
@@ -213,7 +196,7 @@ def index_page(site: Site) -> bytes:
     references = {name: [board for board in boards if board.environment in apart]
                   for name, boards in site.classes.items()}
     return site.page(
-        "index", headline=headline(site), figures=key_figures(site),
+        "index", headline=headline(site), **key_figures(site),
         moving=site.picture(HEADLINE[0], ""), still=site.picture(HEADLINE[1], ""),
         n_environments=sum(not board.is_aggregate for board in site.boards),
         n_records=len(site.records),
@@ -238,32 +221,19 @@ def headline(site: Site) -> Headline | None:
     return Headline(multiple, homogeneous, stationary, filtered, board) if multiple else None
 
 
-def key_figures(site: Site) -> list[KeyFigure]:
-    """Return up to two: skill scores of the best filter and of the best trained agent."""
+def key_figures(site: Site) -> dict[str, Any]:
+    """Return the aggregate of filters with its best row, and the number of its environments, and
+    the leaderboard of agents with its best agent and its best rule; None where there is none."""
     def best(board: Leaderboard | None, *, trained: bool | None = None) -> MethodRow | None:
         return next((row for row in (tables.group_by_agent(board) if board else ())
                      if row.is_ranked and trained in (None, bool(row.trainings))), None)
 
-    def percent(row: MethodRow) -> str:
-        return f"{100 * row.cells['gain']:.0f} %"
-
-    found = []
-    board = site.board("filter", ALL)
-    if board and (first := best(board)):
-        count = sum(each.category == "filter" and each.environment in aggregate_environments()
-                    for each in site.boards)
-        found.append(KeyFigure(percent(first), "less error than the naive baseline with the best "
-                               f"filter ({first.cells['title']}), over {count} environments",
-                               board))
-    board = site.board("injection", AGENT_ENVIRONMENT)
-    agent, rule = best(board, trained=True), best(board, trained=False)
-    if board and agent and rule:
-        found.append(KeyFigure(
-            percent(agent), "less error than random pairs with an agent trained to choose when "
-            f"and where to inject ({agent.cells['title']}, mean of {len(agent.trainings)} "
-            f"training seeds, on {board.title}); {percent(rule)} with the best rule-based policy",
-            board))
-    return found
+    filters, policies = site.board("filter", ALL), site.board("injection", AGENT_ENVIRONMENT)
+    names = aggregate_environments()
+    return {"filters": filters, "best_filter": best(filters), "policies": policies,
+            "best_agent": best(policies, trained=True), "best_rule": best(policies, trained=False),
+            "n_filter_environments": sum(board.category == "filter" and board.environment in names
+                                         for board in site.boards)}
 
 
 # -- environments ----------------------------------------------------------------------------------
