@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from itertools import cycle
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pandas as pd
@@ -50,49 +50,14 @@ def write_report(path: Path, env: MeasuredEnv, runs: Sequence[MeasuredRun],
     data-quality warnings, residuals by electrode, and, with a ``truth`` (256, 256) for
     `eitbench.measured.segmentation`, the segmentations."""
     source = dict(env.measurements.source)
-    calibration = env.calibration
     page = render_template(
         "measured.html.j2", root="", title=str(source.pop("file", "Measurements")), source=source,
-        methods=[(run.method, run.withheld_rmse, 1e3 * run.withheld_rmse_volts,
-                  run.mean_nis(env.task.warm_up)) for run in runs],
-        warnings=env.quality_warnings(),
-        facts=_facts(env), estimate=_estimate(env, runs[0]), first=runs[0].method,
-        over_time=_over_time(env, runs), velocity=_velocity(env, runs),
-        fit=_figure(_fit(env)), correction=CORRECTION_TEXT[calibration.correction],
-        contacts=_figure(_contacts(env)), electrodes=_figure(_electrodes(runs[0])),
-        at_rest=env.task.is_stationary, is_scored=env.withheld > 0.0,
+        env=env, runs=runs, percent=percent, estimate=_estimate(env, runs[0]),
+        over_time=_over_time(env, runs), velocity=_velocity(env, runs), fit=_figure(_fit(env)),
+        correction=CORRECTION_TEXT[env.calibration.correction], contacts=_figure(_contacts(env)),
+        electrodes=_figure(_electrodes(runs[0])),
         segmentation="" if truth is None else _figure(_segmentations(env, runs, truth)))
     write_atomically(path, page)
-
-
-def _facts(env: MeasuredEnv) -> dict[str, str]:
-    """Calibration and prior in words."""
-    calibration, measurements, task = env.calibration, env.measurements, env.task
-    contacts = 1e3 * calibration.contact_impedance
-    facts = {
-        "measurements": f"{len(measurements.injection_index)} times {len(measurements.matrix)}, of "
-                    f"{len(measurements.currents)} different injections",
-        "conductivity": f"{calibration.conductivity:.4g} S/m ± "
-                        f"{percent(calibration.conductivity_std)}",
-        "channel gain": f"{calibration.gain:.4g}",
-        "contact impedances": f"{contacts.min():.3g} to {contacts.max():.3g} mΩ·m²",
-        "noise of the instrument" if calibration.noise_from_repeats else "misfit of the model":
-            _noise(calibration.noise),
-        "noise in the task": _noise(task.noise)}
-    flow = env.vessel.flow
-    if flow is not None and not env.task.is_stationary:
-        spread = f"± {flow.velocity_std:.2g} m/s" if flow.is_estimated else "known"
-        return facts | {"flow": f"{flow.mean_velocity:.3g} m/s on average, {spread}"}
-    facts["initial state"] = (f"± {percent(task.prior.initial_std)} of the background, smooth "
-                              f"over {100 * task.prior.initial_length:.2g} cm")
-    if not env.task.is_stationary:
-        facts["random walk"] = (f"± {percent(task.prior.nodal_std)} of the background in a step "
-                                f"of {1e3 * task.transport.time_step:.3g} ms")
-    return facts
-
-
-def _noise(noise: Any) -> str:
-    return f"{percent(noise.relative)} of the measurement and {1e3 * noise.floor:.2g} mV"
 
 
 def _estimate(env: MeasuredEnv, run: MeasuredRun) -> str:
