@@ -45,10 +45,9 @@ def list_() -> None:
     from eitbench.worlds.task import lag_steps
     lines = []
     for group in GROUPS:
-        names = [name for name in ids() if entry(name).group == group]
-        lines += [(f"environments: {group}", "", "")] * bool(names)
-        for name in names:
-            each = entry(name)
+        found = [each for each in map(entry, ids()) if each.group == group]
+        lines += [(f"environments: {group}", "", "")] * bool(found)
+        for each in found:
             schedule = each.world.schedule
             about = (f"lag {lag_steps(each.world, each.settings.get('lag', 0))}, "
                      f"{schedule.scored_steps} scored of {each.world.n_steps} states")
@@ -56,11 +55,11 @@ def list_() -> None:
                 about += f", at most {schedule.budget} injections"
             if each.nominal:
                 about += f", shifted environment, variant {each.variant} of {each.nominal}"
-            if returns := published_returns(name):
+            if returns := published_returns(each.id):
                 about += ", returns " + ", ".join(f"{row['group']} {float(row['mean']):.3g}"
                                                   for row in returns)
             about += ", recommended to new users" * each.is_starting_point
-            lines.append((f"  {name}", subtracks_of(name, {})[0], about))
+            lines.append((f"  {each.id}", subtracks_of(each.id, {})[0], about))
     lines.append(("environments: measured data", "", ""))
     lines += [(f"  {name}", "measured", "measurements are downloaded separately")
               for name in measured_ids()]
