@@ -124,7 +124,7 @@ def _over_time(env: MeasuredEnv, runs: Sequence[MeasuredRun]) -> str:
     residuals, nis = (each.rolling(max(env.task.warm_up, 1), center=True, min_periods=1).mean()
                       for each in (residuals, nis))
     shown = [(label, curves) for label, curves in (
-        ("withheld residual / noise std", np.sqrt(residuals)), ("NIS/m", nis))
+        ("withheld residual / noise std", residuals**0.5), ("NIS/m", nis))
         if curves.notna().to_numpy().any()]
     if not shown:
         return ""

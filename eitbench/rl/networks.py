@@ -45,19 +45,23 @@ class PairLogits(nn.Module):
         return logits
 
 
-class _PairActions:
-    """Policy of PPO whose action network is `PairLogits`."""
-
-    def _build(self: Any, lr_schedule: Schedule) -> None:
-        super()._build(lr_schedule)  # type: ignore[misc]
-        self.action_net = PairLogits(self.mlp_extractor.latent_dim_pi, int(self.action_space.n))
-        self.optimizer = self.optimizer_class(self.parameters(), lr=lr_schedule(1),
-                                              **self.optimizer_kwargs)
-
-
-class PairPolicy(_PairActions, ActorCriticPolicy):
+class PairPolicy(ActorCriticPolicy):
     """Policy of PPO with `PairLogits`."""
 
+    def _build(self, lr_schedule: Schedule) -> None:
+        super()._build(lr_schedule)
+        _with_pairs(self, lr_schedule)
 
-class MaskablePairPolicy(_PairActions, MaskableActorCriticPolicy):
+
+class MaskablePairPolicy(MaskableActorCriticPolicy):
     """Policy of PPO with action masks and `PairLogits`."""
+
+    def _build(self, lr_schedule: Schedule) -> None:
+        super()._build(lr_schedule)
+        _with_pairs(self, lr_schedule)
+
+
+def _with_pairs(policy: Any, lr_schedule: Schedule) -> None:
+    policy.action_net = PairLogits(policy.mlp_extractor.latent_dim_pi, int(policy.action_space.n))
+    policy.optimizer = policy.optimizer_class(policy.parameters(), lr=lr_schedule(1),
+                                              **policy.optimizer_kwargs)

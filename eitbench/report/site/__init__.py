@@ -175,17 +175,6 @@ def write_site(folder: Path, files: Mapping[str, bytes]) -> None:
 # -- index -----------------------------------------------------------------------------------------
 
 
-class Headline(NamedTuple):
-    """Errors ẽ_c of images with and without a flow model."""
-
-    multiple: str
-    """stationary / filtered in words"""
-    homogeneous: float
-    stationary: float
-    filtered: float
-    board: Leaderboard
-
-
 def index_page(site: Site) -> bytes:
     """Return the HTML of ``index.html``."""
     apart = reference_environments()
@@ -209,8 +198,9 @@ def index_page(site: Site) -> bytes:
                                          for _, table, _ in boards))
 
 
-def headline(site: Site) -> Headline | None:
-    """Return how many times a flow model reduces the error; None without official records."""
+def headline(site: Site) -> dict[str, Any] | None:
+    """Return the errors ẽ_c of images with and without a flow model, their ratio in words and the
+    leaderboard; None without official records."""
     board = site.board("filter", HEADLINE_ENVIRONMENT)
     errors = {row.cells["method"]: row.cells["error"] for row in (board.rows if board else ())
               if row.cells["official"] and row.complete}
@@ -218,7 +208,8 @@ def headline(site: Site) -> Headline | None:
         return None
     homogeneous, stationary, filtered = (errors[name] for name in HEADLINE_METHODS)
     multiple = MULTIPLES.get(int(stationary / filtered))
-    return Headline(multiple, homogeneous, stationary, filtered, board) if multiple else None
+    return {"multiple": multiple, "homogeneous": homogeneous, "stationary": stationary,
+            "filtered": filtered, "board": board} if multiple else None
 
 
 def key_figures(site: Site) -> dict[str, Any]:
