@@ -17,9 +17,9 @@ from typer.testing import CliRunner
 
 from tiny import BOARD_IDS, RUN, record
 
-TEXTS = ["<script>alert(1)</script>", "<b onmouseover=alert(1)>", "\"'><img src=http://x>", "| a | b |", "{{ 7*109300 }}",
-         "{% raw %}", "[a](http://x)", "](http://x)", "`<b>`", "&lt;b&gt;", "--><b>", "]]><b>", "\x1b[2J", "\u202eevil",
-         "a\u2028b", "\u200bz"]
+TEXTS = ["<script>alert(1)</script>", "<b onmouseover=alert(1)>", "\"'><img src=http://x>", "| a | b |",
+         "{{ 7*109300 }}", "{% raw %}", "[a](http://x)", "](http://x)", "`<b>`", "&lt;b&gt;", "--><b>", "]]><b>",
+         "\x1b[2J", "\u202eevil", "a\u2028b", "\u200bz"]
 UNSEEN = r"[\x00-\x08\x0b-\x1f\x7f-\x9f\u200b-\u200f\u2028-\u202e\u2066-\u2069]"
 
 
