@@ -88,7 +88,7 @@ class MethodRow(NamedTuple):
     """Seed -> skill score; empty without a naive baseline."""
     colour: int = 0
     trainings: tuple[MethodRow, ...] = ()
-    """Training seeds of which this is the mean, the best first."""
+    """Training seeds, the best first, if the row is their mean."""
 
     @property
     def label(self) -> str:
@@ -457,8 +457,8 @@ def _aggregate(category: str, made: list[Leaderboard]) -> list[Leaderboard]:
 
 
 def read_leaderboard_records(folder: Path) -> tuple[list[dict[str, Any]], list[str]]:
-    """Return the records of a folder, and one message for each that leaderboards leave out: invalid
-    ones, and those of other seeds than test. ``ValueError`` if no other record exists."""
+    """Return the records of a folder, and one message for each record that leaderboards leave out,
+    since it is invalid or has other seeds than test. ``ValueError`` if no other record exists."""
     read, complaints = read_valid_files(folder)
     others = [f"record {path} has {record['split']} seeds, and leaderboards are made of test seeds"
               for path, record in read.items() if record["split"] != "test"]

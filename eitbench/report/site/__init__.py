@@ -214,7 +214,7 @@ def headline(site: Site) -> dict[str, Any] | None:
 
 def key_figures(site: Site) -> dict[str, Any]:
     """Return the aggregate of filters with its best row, and the number of its environments, and
-    the leaderboard of agents with its best agent and its best rule; None where there is none."""
+    the leaderboard of agents with its best agent and its best rule; missing ones are None."""
     def best(board: Leaderboard | None, *, trained: bool | None = None) -> MethodRow | None:
         return next((row for row in (tables.group_by_agent(board) if board else ())
                      if row.is_ranked and trained in (None, bool(row.trainings))), None)
