@@ -64,7 +64,7 @@ def bank(jobs: int) -> float:
     """Return the seconds of `eitbench bank` with an empty cache, including the start of Python."""
     with tempfile.TemporaryDirectory() as empty:
         begin = time.perf_counter()
-        command = [sys.executable, "-m", "eitbench.cli.app", "bank", "--seeds",
+        command = [sys.executable, "-m", "eitbench.cli", "bank", "--seeds",
                    f"train:0-{BANK - 1}", "-j", str(jobs)]
         subprocess.run(command, env=os.environ | {"EITBENCH_CACHE": empty}, check=True,
                        capture_output=True)

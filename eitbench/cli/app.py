@@ -45,10 +45,9 @@ def list_() -> None:
     from eitbench.worlds.task import lag_steps
     lines = []
     for group in GROUPS:
-        names = [name for name in ids() if entry(name).group == group]
-        lines += [(f"environments: {group}", "", "")] * bool(names)
-        for name in names:
-            each = entry(name)
+        found = [each for each in map(entry, ids()) if each.group == group]
+        lines += [(f"environments: {group}", "", "")] * bool(found)
+        for each in found:
             schedule = each.world.schedule
             about = (f"lag {lag_steps(each.world, each.settings.get('lag', 0))}, "
                      f"{schedule.scored_steps} scored of {each.world.n_steps} states")
@@ -56,11 +55,11 @@ def list_() -> None:
                 about += f", at most {schedule.budget} injections"
             if each.nominal:
                 about += f", shifted environment, variant {each.variant} of {each.nominal}"
-            if returns := published_returns(name):
+            if returns := published_returns(each.id):
                 about += ", returns " + ", ".join(f"{row['group']} {float(row['mean']):.3g}"
                                                   for row in returns)
             about += ", recommended to new users" * each.is_starting_point
-            lines.append((f"  {name}", subtrack_of_id(name), about))
+            lines.append((f"  {each.id}", subtrack_of_id(each.id), about))
     lines.append(("environments: measured data", "", ""))
     lines += [(f"  {name}", "measured", "measurements are downloaded separately")
               for name in measured_ids()]
@@ -80,9 +79,7 @@ def submit(
     env: options.Environments = None,
     baseline: Annotated[str | None, typer.Option(
         help="Built-in estimator name, or path of a .py file.")] = None,
-    policy: Annotated[str | None, typer.Option(
-        help="Built-in injection policy name, or path of a .py file or of an agent's model.zip. "
-             "Default: all built-in methods, in all environments.")] = None,
+    policy: options.Policy = None,
     seeds: Annotated[str | None, typer.Option(
         help="Episode seeds, e.g. test:0-9. Default: all seeds of the leaderboards.")] = None,
     official: Annotated[bool, typer.Option(
@@ -93,8 +90,8 @@ def submit(
     out: options.Out = Path("results"),
     to: Annotated[Path, typer.Option(help="Folder of the records.")] = options.RECORDS,
 ) -> None:
-    """Run the test episodes with one estimator or policy, or all built-in ones, and write records
-    for the leaderboards.
+    """Run the test episodes with one estimator or policy, by default with all built-in ones, and
+    write records for the leaderboards.
 
     Each episode is stored in OUT when it finishes; the same command resumes an interrupted run.
     """
@@ -170,13 +167,12 @@ def leaderboard(
             return print_report(out)
     from eitbench._files import write_atomically
     from eitbench.bench.episode_table import table_path, write_episode_table
-    from eitbench.bench.records import read_valid_files
     from eitbench.report.boards import read_leaderboard_records
     from eitbench.report.site import collect, render, render_site, write_site
     with options.cli_errors():
         found, complaints = read_leaderboard_records(records)
         out = records.parent
-        site = collect(found, out)
+        site = collect([record for record in found if record["split"] == "test"], out)
         complaints += site.measured.errors
         texts = render(site)
         write_site(out / "site", render_site(site))
@@ -184,7 +180,7 @@ def leaderboard(
         write_atomically(out / name, text.encode())
         options.echo(f"wrote {out / name}")
     options.echo(f"wrote {out / 'site' / 'index.html'}")
-    write_episode_table(read_valid_files(records)[0].values(), table_path(records))
+    write_episode_table(found, table_path(records))
     options.echo(f"wrote {table_path(records)}")
     for complaint in complaints:
         options.echo(f"left out: {complaint}", err=True)
@@ -219,9 +215,7 @@ def render(
     env: options.EnvironmentId = "eitbench/Pipe2D-v0",
     baseline: Annotated[list[str] | None, typer.Option(
         help="Estimator name or path; may be repeated. Default: kalman_filter.")] = None,
-    policy: Annotated[str | None, typer.Option(
-        help="Built-in injection policy name, or path of a .py file or of an agent's model.zip; "
-             "for injection environments.")] = None,
+    policy: options.Policy = None,
     seed: Annotated[str, typer.Option(help="Episode seed, e.g. dev:0.")] = "dev:0",
     step: Annotated[int | None, typer.Option(help="Only this state t, as a PNG.")] = None,
     every: Annotated[int, typer.Option(min=1, help="Draw every Nth state.")] = 1,

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -62,10 +62,9 @@ def export(
     env: options.EnvironmentId = "eitbench/Pipe2D-v0",
     seeds: Annotated[str, typer.Option(help="Episode seeds, e.g. train:0-999.")] = "train:0-99",
     format: Annotated[Format, typer.Option(
-        help="File format; hdf5 needs the extra export, minari the extra minari.")] = Format.npz,
-    policy: Annotated[str | None, typer.Option(
-        help="Injection policy, for minari: a built-in name, or the path of a file, which runs in "
-             "this process.")] = None,
+        help="File format; hdf5 needs the extra export, minari the extra minari and --policy, "
+             "which runs in this process.")] = Format.npz,
+    policy: options.Policy = None,
     jobs: options.Jobs = options.CORES,
     backend: options.Backends = options.Backend.loky,
 ) -> None:
@@ -147,7 +146,7 @@ def train(
 def fit_prior(
     env: options.EnvironmentId,
     out: Annotated[Path, typer.Option("--out", "-o", help="File to write, JSON.")],
-    seeds: Annotated[str, typer.Option(help="Episodes of the split train.")] = "train:0-199",
+    seeds: options.TrainSeeds = "train:0-199",
     link: Annotated[Link, typer.Option(
         help="Gaussian quantity: the inflow's logarithm, or the inflow.")] = Link.logarithm,
     nugget: Annotated[float, typer.Option(
@@ -164,13 +163,13 @@ def fit_prior(
     from eitbench.data.seeds import parse_seeds
     from eitbench.estimation import fit_prior_from_episodes
     from eitbench.worlds.registry import entry
-    regimes = {} if quiet is None else {"quiet": quiet}
+    source: dict[str, Any] = {"environment": env, "seeds": seeds, "nugget": nugget, "kept": kept}
+    if quiet is not None:
+        source["quiet"] = quiet
     with options.cli_errors():
         prior = fit_prior_from_episodes(
             entry(env).world, parse_seeds(seeds), link=link.value, nugget=nugget,
-            variance_cutoff=kept, quiet_threshold=quiet,
-            source={"environment": env, "seeds": seeds, "nugget": nugget, "kept": kept,
-                    **regimes})
+            variance_cutoff=kept, quiet_threshold=quiet, source=source)
         prior.save(out)
     options.echo(f"{out}: {prior.modes.shape[1]} modes across {len(prior.points)} nodes of the "
                 f"inlet, correlated over {prior.correlation_steps} steps of {prior.time_step:g} s")
@@ -183,7 +182,7 @@ def fit_prior(
 def fit_model(
     env: options.EnvironmentId,
     out: Annotated[Path, typer.Option("--out", "-o", help="File to write, npz.")],
-    seeds: Annotated[str, typer.Option(help="Episodes of the split train.")] = "train:0-199",
+    seeds: options.TrainSeeds = "train:0-199",
     modes: Annotated[int, typer.Option(
         min=1, help="Number of concentration modes; more make filters slower.")] = 64,
     correct: Annotated[bool, typer.Option(
@@ -207,8 +206,7 @@ def fit_model(
             examples, modes=modes, residual_only=correct, linearised=linearised,
             progress=lambda each: tqdm(each, desc="learning", unit="episode", disable=None),
             source={"environment": env, "seeds": seeds, "modes": modes}
-            | {name: True for name, said in (("correct", correct), ("linearised", linearised))
-               if said})
+            | dict.fromkeys(["correct"] * correct + ["linearised"] * linearised, True))
         model.save(out)
     left = float(model.residual_covariance.trace() / examples.mass.sum())
     options.echo(f"{out}: {modes} modes of the concentration, impulse response of "

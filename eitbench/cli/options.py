@@ -71,6 +71,9 @@ Environments = Annotated[list[str] | None, typer.Option(
     help=f"Environment {_ENV_HELP} May be repeated.", callback=import_env)]
 EnvironmentId = Annotated[str, typer.Option(
     "--env", help=f"Environment {_ENV_HELP}", callback=import_env)]
+Policy = Annotated[str | None, typer.Option(
+    help="Injection policy: built-in name, or path of a .py file or of an agent's model.zip.")]
+TrainSeeds = Annotated[str, typer.Option(help="Episode seeds of the split train.")]
 Records = Annotated[Path, typer.Option(
     help="Folder of the records. If it is missing, the records of the package are used.",
     callback=resolve_path)]

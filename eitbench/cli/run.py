@@ -136,14 +136,14 @@ def command_line() -> str:
 
 def _say_failures(store: EpisodeStore, records: list[dict[str, Any]],
                   asked: Sequence[Job]) -> None:
-    """Print the failures, and a command to debug the first."""
-    from eitbench.report.failures import debug_command, failures
+    """Print the failures, and how to debug the first."""
+    from eitbench.report.failures import failures
     found = failures(store, records)
     for failure in found:
         options.echo(failure, err=True)
-    hints = filter(None, (debug_command(failure, asked) for failure in found))
-    if (hint := next(hints, "")) and "--isolate none" not in command_line().replace("=", " "):
-        options.echo(f"to debug it in this process, where breakpoint() stops:\n  {hint}", err=True)
+    if found and any(job.isolation != "none" for job in asked):
+        options.echo(f"with --seeds {found[0].seeds[0]} --isolate none --jobs 1 the method runs in "
+                     "this process, where breakpoint() stops", err=True)
 
 
 def _end_if_lost(asked: Sequence[Job], store: EpisodeStore,

@@ -89,6 +89,8 @@ class MethodRow(NamedTuple):
     skill_scores: dict[str, float] = {}  # noqa: RUF012 (never changed)
     """Seed -> skill score; empty without a naive baseline."""
     colour: int = 0
+    trainings: tuple[MethodRow, ...] = ()
+    """Training seeds, the best first, if the row is their mean."""
 
     @property
     def label(self) -> str:
@@ -195,7 +197,7 @@ def headings(*, measured: bool = False) -> dict[str, str]:
 
 def column_descriptions(*, measured: bool = False) -> dict[str, str]:
     """Return heading -> explanation."""
-    return {"rank": _RANK} | dict(columns(measured=measured).values())
+    return {"rank": _RANK, **dict(columns(measured=measured).values())}
 
 
 def csv_fields() -> list[str]:
@@ -457,19 +459,17 @@ def _aggregate(category: str, made: list[Leaderboard]) -> list[Leaderboard]:
 
 
 def read_leaderboard_records(folder: Path) -> tuple[list[dict[str, Any]], list[str]]:
-    """Return the records of a folder that boards show, and one message for each invalid record.
-    ``ValueError`` if the folder does not exist or holds no valid record of test seeds."""
-    if not folder.is_dir():
-        raise ValueError(f"records must be a folder that exists, got {folder}")
+    """Return the records of a folder, and one message for each record that leaderboards leave out,
+    since it is invalid or has other seeds than test. ``ValueError`` if no other record exists."""
     read, complaints = read_valid_files(folder)
-    complaints += [f"record {path} has {record['split']} seeds, and leaderboards are made of test "
-                   "seeds" for path, record in read.items() if record["split"] != "test"]
-    found = [record for record in read.values() if record["split"] == "test"]
-    if not found:
+    others = [f"record {path} has {record['split']} seeds, and leaderboards are made of test seeds"
+              for path, record in read.items() if record["split"] != "test"]
+    complaints += others
+    if len(others) == len(read):
         raise ValueError("; ".join([f"records must be a folder with records of test seeds, got "
                                     f"{folder}, which holds no valid record of test seeds",
                                     *complaints]))
-    return found, complaints
+    return list(read.values()), complaints
 
 
 # -- skill and cost --------------------------------------------------------------------------------

@@ -8,18 +8,17 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
-from html import escape
 from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
 from markupsafe import Markup
 
-from eitbench._sanitize import sanitize
+from eitbench.report.templates import N_COLOURS, macro
 
-WIDTH, HEIGHT, LEFT, RIGHT, TOP, BOTTOM = 860, 360, 76, 30, 12, 46
-N_COLOURS = 12
-"""--c0 … --c11 of the style sheet; further series repeat them, dashed."""
+WIDTH, HEIGHT, LEFT, RIGHT, TOP, BOTTOM = 860, 360, 76, 830, 12, 314
+"""Size of a chart, and the edges of its axes, px."""
+BOX = {"width": WIDTH, "height": HEIGHT, "left": LEFT, "right": RIGHT, "top": TOP, "bottom": BOTTOM}
 CELL_WIDTH_PX = 96
 """Width of a drawing in a table's cell, px."""
 CHAR_WIDTH = 7.0
@@ -61,13 +60,18 @@ class Chart(NamedTuple):
 
 
 class Axis:
-    """Map from values to px, logarithmic or linear, with ticks at round numbers."""
+    """Map from values to px, logarithmic or linear, with ticks at round numbers.
 
-    def __init__(self, low: float, high: float, begin: float, end: float, *, log: bool) -> None:
+    As HTML it is drawn for a column of `sparkline`s, with a line at ``mark``.
+    """
+
+    def __init__(self, low: float, high: float, begin: float, end: float, *, log: bool,
+                 mark: float | None = None) -> None:
         if high - low <= 1e-12 * max(abs(low), abs(high)):                 # a single value
             low, high = (low / 2, low * 2) if log else (low, low + max(1.0, abs(low)))
         self.low, self.high = low, high
         self.begin, self.end, self.log = begin, end, log
+        self.mark = mark if mark is not None and self.low <= mark <= self.high else None
 
     def __call__(self, value: float) -> float:
         value = max(value, self.low)
@@ -91,48 +95,50 @@ class Axis:
         first, last = math.ceil(self.low / step - 1e-9), math.floor(self.high / step + 1e-9)
         return [round(i * step, 12) for i in range(first, last + 1)]
 
+    def __html__(self) -> str:
+        """Return the drawn axis, with a number at its first and its last tick."""
+        ticks = self.ticks()
+        far = len(ticks) > 1 and self(ticks[-1]) - self(ticks[0]) > 0.5 * CELL_WIDTH_PX
+        return macro("sparkline_axis")(CELL_WIDTH_PX, self, ticks, [*ticks[:1] * far, *ticks[-1:]])
+
 
 def line_chart(x: np.ndarray, series: Sequence[Series], x_label: str, y_label: str, *,
-               log: bool = False) -> Markup:
+               log: bool = False) -> Chart:
     """Draw curves over a linear or logarithmic x axis and a logarithmic y axis; a series may end
     before ``x``, and NaN are left out."""
     values = np.concatenate([s.values for s in series])
     least = values[values > 0].min(initial=1.0) / 1.15  # where a perfect estimate's zero is drawn
-    px = Axis(x[0], x[-1], LEFT, WIDTH - RIGHT, log=log)
-    py = Axis(least, max(np.nanmax(values), least) * 1.15, HEIGHT - BOTTOM, TOP, log=True)
-    parts = _frame(px, py, x_label, y_label)
-    for s in sorted(series, key=lambda s: not s.faint):
-        places = [(px(a), py(b)) for a, b in zip(x, s.values, strict=False) if b == b]
-        parts.append(_polyline(f"series{' faint' * s.faint}", places, s.colour, s.name))
-    return Markup("".join([*parts, "</svg>"]))
+    px = Axis(x[0], x[-1], LEFT, RIGHT, log=log)
+    py = Axis(least, max(np.nanmax(values), least) * 1.15, BOTTOM, TOP, log=True)
+    curves = [(s, [(px(a), py(b)) for a, b in zip(x, s.values, strict=False) if b == b])
+              for s in sorted(series, key=lambda s: not s.faint)]
+    shown = [s for s in series if not s.faint]
+    return Chart(macro("line_chart")(BOX, px, py, x_label, y_label, curves), _legend(shown),
+                 " Thin lines: all other methods." if len(shown) < len(series) else "")
 
 
-def pareto_chart(points: Sequence[ParetoPoint], x_label: str, y_label: str) -> Markup:
+def pareto_chart(points: Sequence[ParetoPoint], x_label: str, y_label: str) -> Chart:
     """Draw marks over two logarithmic axes, where small is good; `pareto_front` ones are filled and
-    joined. Names are written next to their marks where they fit."""
+    joined, and the note names them. Names are written next to their marks where they fit."""
     def axis(values: list[float], begin: float, end: float) -> Axis:
         positive = [value for value in values if value > 0] or [1.0]  # a zero is at the edge
         return Axis(min(positive) / 1.4, max(positive) * 1.4, begin, end, log=True)
 
-    px = axis([p.x for p in points], LEFT, WIDTH - RIGHT)
-    py = axis([p.y for p in points], HEIGHT - BOTTOM, TOP)
+    px = axis([p.x for p in points], LEFT, RIGHT)
+    py = axis([p.y for p in points], BOTTOM, TOP)
     best = pareto_front(points)
-    parts = [*_frame(px, py, x_label, y_label),
-             _polyline("front", [(px(p.x), py(p.y)) for p in best])]
     taken = [(px(p.x) - 6, py(p.y) - 6, px(p.x) + 6, py(p.y) + 6) for p in points]
     for a, b in pairwise(best):  # names keep off the line too
         along = (np.linspace(px(a.x), px(b.x), 40), np.linspace(py(a.y), py(b.y), 40))
         taken += [(x - 1, y - 1, x + 1, y + 1) for x, y in zip(*along, strict=True)]
+    marks = []
     for p in [*best, *(p for p in points if p not in best)]:  # the best choose their places first
-        colour = _colour(p.colour)
-        fill = colour if p in best else "var(--card)"
-        parts.append(f'<circle style="fill:{fill};stroke:{colour};stroke-width:2" '
-                     f'cx="{px(p.x):.1f}" cy="{py(p.y):.1f}" r="5">'
-                     f'{_svg_title(f"{p.name}: {p.x:.3g}, {p.y:.3g}")}</circle>')
         name = truncate(p.name, MAX_POINT_LABEL_CHARS)
-        if place := _free_position(px(p.x), py(p.y), CHAR_WIDTH * len(name), taken):
-            parts.append(_text(*place, name, "name"))
-    return Markup("".join([*parts, "</svg>"]))
+        place = _free_position(px(p.x), py(p.y), CHAR_WIDTH * len(name), taken)
+        marks.append((p, p in best, name, place))
+    svg = macro("pareto_chart")(BOX, px, py, x_label, y_label, marks,
+                                [(px(p.x), py(p.y)) for p in best])
+    return Chart(svg, _legend(points), f": {', '.join(p.name for p in best)}" if best else "")
 
 
 def pareto_front(points: Iterable[ParetoPoint]) -> list[ParetoPoint]:
@@ -144,35 +150,16 @@ def pareto_front(points: Iterable[ParetoPoint]) -> list[ParetoPoint]:
     return best
 
 
-def legend(series: Iterable[Series | ParetoPoint]) -> list[tuple[int, bool, str]]:
-    """Return the legend of series or points."""
+def _legend(series: Iterable[Series | ParetoPoint]) -> list[tuple[int, bool, str]]:
     return [(s.colour % N_COLOURS, s.colour >= N_COLOURS, s.name) for s in series]
 
 
-def sparkline(three: tuple[float, float, float], px: Axis, *, mark: float | None = None,
-              each: Iterable[float] = ()) -> Markup:
-    """Draw a dot and its interval for a table's cell, on the axis of its column, with a line at
-    ``mark`` and a stroke for ``each`` value of a mean. Hidden from screen readers: the adjacent
+def sparkline(three: tuple[float, float, float], px: Axis, each: Iterable[float] = ()) -> Markup:
+    """Draw a dot and its interval for a table's cell, on the axis of its column, with a line at the
+    axis' mark and a stroke for ``each`` value of a mean. Hidden from screen readers: the adjacent
     number has the same content."""
-    value, a, b = (min(end if math.isfinite(end) else three[0], px.high) for end in three)
-    strokes = "".join(f"M{px(min(one, px.high)):.1f} 2V12" for one in each)
-    return Markup(f'<svg class="cell" viewBox="0 0 {CELL_WIDTH_PX} 14" aria-hidden="true">'
-                  f'{_vertical_line(px, mark)}'
-                  f'<line x1="{px(a):.1f}" x2="{px(b):.1f}" y1="7" y2="7"/>'
-                  + (f'<path class="each" d="{strokes}"/>' if strokes else "")
-                  + f'<circle cx="{px(value):.1f}" cy="7" r="3"/></svg>')
-
-
-def sparkline_axis(px: Axis, *, mark: float | None = None) -> Markup:
-    """Draw the axis of a column of `sparkline`s, with a number at its first and its last tick."""
-    ticks = px.ticks()
-    strokes = "".join(f"M{px(tick):.1f} 0V4" for tick in ticks)
-    far = len(ticks) > 1 and px(ticks[-1]) - px(ticks[0]) > 0.5 * CELL_WIDTH_PX
-    labels = "".join(_text(px(tick), 14, "middle", _format_tick(tick).replace("-", "−"))
-                     for tick in (ticks[:1] if far else []) + ticks[-1:])
-    return Markup(f'<svg class="cell axis" viewBox="0 0 {CELL_WIDTH_PX} 16" aria-hidden="true">'
-                  f'<path d="M{px.begin} 0H{px.end}{strokes}"/>{_vertical_line(px, mark, 6)}'
-                  f'{labels}</svg>')
+    ends = (min(end if math.isfinite(end) else three[0], px.high) for end in three)
+    return macro("sparkline")(CELL_WIDTH_PX, px, *ends, [min(one, px.high) for one in each])
 
 
 def truncate(name: str, letters: int) -> str:
@@ -180,69 +167,16 @@ def truncate(name: str, letters: int) -> str:
     return name if len(name) <= letters else f"{name[:letters - 1].rstrip()}…"
 
 
-def _vertical_line(px: Axis, mark: float | None, height: float = 14) -> str:
-    """Draw a line across a cell, if it is on the axis."""
-    if mark is None or not px.low <= mark <= px.high:
-        return ""
-    return f'<path class="grid" d="M{px(mark):.1f} 0V{height}"/>'
-
-
-def _frame(px: Axis, py: Axis, x_label: str, y_label: str) -> list[str]:
-    """Begin a drawing with grid, ticks and labels."""
-    bottom = HEIGHT - BOTTOM
-    label = escape(sanitize(f"{y_label} over {x_label}"))
-    parts = [f'<svg viewBox="0 0 {WIDTH} {HEIGHT}" role="img" aria-label="{label}">']
-    for tick in py.ticks():
-        parts += [_polyline("grid", [(LEFT, py(tick)), (WIDTH - RIGHT, py(tick))]),
-                  _text(LEFT - 8, py(tick) + 4, "end", _format_tick(tick))]
-    for tick in px.ticks():
-        parts += [_polyline("grid", [(px(tick), bottom), (px(tick), bottom + 5)]),
-                  _text(px(tick), bottom + 18, "middle", _format_tick(tick))]
-    return [*parts, _text((LEFT + WIDTH - RIGHT) / 2, HEIGHT - 6, "middle", x_label),
-            f'<text text-anchor="middle" transform="translate(14 {(bottom + TOP) / 2}) '
-            f'rotate(-90)">{escape(y_label)}</text>']
-
-
-def _text(x: float, y: float, anchor: str, words: str, kind: str = "") -> str:
-    of_kind = f' class="{kind}"' if kind else ""
-    return (f'<text{of_kind} x="{x:.1f}" y="{y:.1f}" text-anchor="{anchor}">'
-            f'{escape(sanitize(words))}</text>')
-
-
-def _svg_title(words: str) -> str:
-    return f"<title>{escape(sanitize(words))}</title>"
-
-
-def _polyline(kind: str, places: Sequence[tuple[float, float]], colour: int | None = None,
-              title: str = "") -> str:
-    """Draw a line of this class of the style sheet, in a colour of the page, with a title."""
-    points = " ".join(f"{x:.1f},{y:.1f}" for x, y in places)
-    if colour is None:
-        return f'<polyline class="{kind}" points="{points}"/>'
-    dashes = ";stroke-dasharray:6 3" if colour >= N_COLOURS else ""
-    return (f'<polyline class="{kind}" style="stroke:{_colour(colour)}{dashes}" points="{points}">'
-            f'{_svg_title(title)}</polyline>')
-
-
-def _colour(number: int) -> str:
-    return f"var(--c{number % N_COLOURS})"
-
-
-def _format_tick(tick: float) -> str:
-    """``200,000`` and ``0.002``, never ``2e+05``."""
-    return f"{tick:,.0f}" if abs(tick) >= 1e4 else f"{tick:g}"
-
-
-def _free_position(x: float, y: float, width: float, taken: list[tuple[float, float, float, float]]
-          ) -> tuple[float, float, str] | None:
+def _free_position(x: float, y: float, width: float,
+                   taken: list[tuple[float, float, float, float]],
+                   ) -> tuple[float, float, str] | None:
     """Return where a name of this width fits next to (x, y) without overlapping ``taken``, to which
     it is added."""
     for dx, dy, anchor in ((10, 4, "start"), (-10, 4, "end"), (6, -9, "start"), (6, 18, "start"),
                            (-6, -9, "end"), (-6, 18, "end")):
         left = x + dx - width * (anchor == "end")
         right, top, bottom = left + width, y + dy - 11, y + dy + 3
-        inside = (left > LEFT and right < WIDTH - 2 * CHAR_WIDTH and top > 0
-                  and bottom < HEIGHT - BOTTOM)
+        inside = left > LEFT and right < WIDTH - 2 * CHAR_WIDTH and top > 0 and bottom < BOTTOM
         if inside and not any(left < b[2] and b[0] < right and top < b[3] and b[1] < bottom
                               for b in taken):
             taken.append((left, top, right, bottom))

@@ -16,9 +16,8 @@ from eitbench.bench.records import (
     read_record,
     read_records,
     split_outdated,
-    version_number,
 )
-from eitbench.bench.scores import Score, scores
+from eitbench.bench.scores import scores
 from eitbench.bench.statistics import (
     Statistic,
     agent_name,
@@ -28,29 +27,26 @@ from eitbench.bench.statistics import (
     paired_difference,
     paired_probability_of_improvement,
 )
-from eitbench.bench.table import MISSING, Cell, Table, number_cell
-from eitbench.bench.text import format_interval, scores_by_seed
+from eitbench.bench.table import MISSING, Cell, Table
+from eitbench.bench.text import format_interval, format_number, scores_by_seed
 from eitbench.bench.tracks import CATEGORIES, nominal_id, qualified_name
 from eitbench.report.boards import is_naive_baseline, record_category, skill_scores
 
-COMPARISON_FIELDS = ("environment", "score", "episodes", "a", "b", "advantage", "low", "high",
-          "better", "better_low", "better_high")
+Pair = tuple[dict[str, float], dict[str, float]]
+"""Scores of a and b by seed."""
 SKILL_SCORE = "skill score"
 """Score over several environments instead of the error, whose mean the largest error dominates."""
 BUNDLED_RECORDS = bundled_path("leaderboards") / "results"
 """Records of the package."""
 OWN_RECORDS = Path("results/records")
 """Records of `eitbench run`."""
-MIN_VERSION_PREFIX = 4
-"""Smallest number of leading sha256 digits that identify a version."""
 
 
 def find_records(name: str, folder: Path) -> list[dict[str, Any]]:
     """Return the record in the file NAME.json, or the records METHOD or METHOD@VERSION of the
     first of these that has any: a folder, the package, `OWN_RECORDS`. Without a version the current
-    official records are returned, or else the other current ones. A third-party version may be
-    shortened to four digits. The name of an agent without training seed, such as ppo, selects its
-    `mean_over_trainings`.
+    official records are returned, or else the other current ones. The name of an agent without
+    training seed, such as ppo, selects its `mean_over_trainings`.
 
     Raises
     ------
@@ -60,11 +56,6 @@ def find_records(name: str, folder: Path) -> list[dict[str, Any]]:
     if name.endswith(".json"):
         return [read_record(resolve_input(Path(name)))]
     method, _, version = name.partition("@")
-
-    def fits(own: str) -> bool:
-        shortened = version_number(own) is None and len(version) >= MIN_VERSION_PREFIX
-        return own == version or (shortened and own.startswith(version))
-
     known: set[str] = set()
     for place in dict.fromkeys(map(Path.resolve, (folder, BUNDLED_RECORDS, OWN_RECORDS))):
         there = read_records(place)
@@ -72,7 +63,7 @@ def find_records(name: str, folder: Path) -> list[dict[str, Any]]:
         if not version:
             there = split_outdated(there)[0]
         own = [record for record in there
-               if record["method"] == method and (not version or fits(record["version"]))]
+               if record["method"] == method and version in ("", record["version"])]
         if not version:
             own = [record for record in own if record["official"]] or own or mean_over_trainings(
                 [record for record in there if agent_name(record["method"]) == method])
@@ -105,18 +96,11 @@ def mean_over_trainings(records: list[dict[str, Any]]) -> list[dict[str, Any]]:
     return means
 
 
-def resolve_score(name: str) -> Score:
-    """Return the score of this name; ``ValueError`` if it is unknown or has no better direction."""
-    known = {each.name: each for each in scores().values() if each.direction in ("lower", "higher")}
-    _check.choice("score", name, known)
-    return known[name]
-
-
 def naive_baseline_records(folder: Path) -> list[dict[str, Any]]:
     """Return the current records of naive baselines, of the package and then of a folder."""
     folders = dict.fromkeys([BUNDLED_RECORDS.resolve(), folder.resolve()])
     return split_outdated([record for each in folders for record in read_records(each)
-                   if is_naive_baseline(record)])[0]
+                           if is_naive_baseline(record)])[0]
 
 
 def compare(a: list[dict[str, Any]], b: list[dict[str, Any]], score: str = "error",
@@ -132,62 +116,69 @@ def compare(a: list[dict[str, Any]], b: list[dict[str, Any]], score: str = "erro
     -------
     DataFrame
         environment, score (or `SKILL_SCORE`), episodes; a, b: means; advantage of a: b − a if
-        lower scores are better, else a − b, with the ends of its 95 % interval; better: fraction of
-        episodes in which a is better (an equal score counts ½), with the ends of its interval. Over
-        several environments interquartile means of skill scores, or means of the environments'
-        means.
+        lower scores are better, else a − b, with the ends low and high of its 95 % interval;
+        better: fraction of episodes in which a is better (an equal score counts ½), with the ends
+        better_low and better_high of its interval. Over several environments interquartile means
+        of skill scores, or means of the environments' means.
 
     Raises
     ------
     ValueError
         If the score is unknown, or the methods share no finished episode with this score.
     """
-    higher = resolve_score(score).direction == "higher"
+    known = {each.name: each.direction for each in scores().values()}
+    _check.choice("score", score, [name for name in known if known[name] in ("lower", "higher")])
     theirs = {_environment_and_split(record): scores_by_seed(record, score) for record in b}
-    both: dict[str, tuple[dict[str, float], dict[str, float]]] = {}
-    gains: dict[str, dict[str, Any]] = {kind: {} for kind in CATEGORIES}
     levels = {_environment_and_split(record): scores_by_seed(record, "error") for record in
               sorted(zero, key=lambda record: (record["official"], finished_at(record)))}
+    pairs: dict[str, Pair] = {}
+    gains: dict[str, dict[str, Pair]] = {kind: {} for kind in CATEGORIES}
     for record in sorted(a, key=_environment_and_split):
-        place = name, split = _environment_and_split(record)
-        pair = scores_by_seed(record, score), theirs.get(place, {})
-        shared = pair[0].keys() & pair[1].keys()
-        if shared:
-            label = name if split == "test" else f"{name} ({split} seeds)"
-            own, other = ({seed: each[seed] for seed in shared} for each in pair)
-            both[label] = own, other
-            level = levels.get(place, {})
-            if (gained := skill_scores(level, own)) and not nominal_id(record["environment"]["id"]):
-                gains[record_category(record)][label] = gained, skill_scores(level, other)
-    if not both:
+        key = name, split = _environment_and_split(record)
+        own, other = scores_by_seed(record, score), theirs.get(key, {})
+        shared = own.keys() & other.keys()
+        if not shared:
+            continue
+        label = name if split == "test" else f"{name} ({split} seeds)"
+        own, other = ({seed: each[seed] for seed in shared} for each in (own, other))
+        pairs[label] = own, other
+        gained, others = (skill_scores(levels.get(key, {}), each) for each in (own, other))
+        if gained and not nominal_id(record["environment"]["id"]):
+            gains[record_category(record)][label] = gained, others
+    if not pairs:
         finished = (f"{len(scores_by_seed(record, score))} episodes of {record['method']} in "
                     f"{qualified_name(record['environment'])}" for record in (*a, *b))
         raise ValueError(f"methods must share an environment and a seed that both finished with "
                          f"{score}; there are {', '.join(finished)}")
+    higher = known[score] == "higher"
     rows = [_row(label, score, {label: pair}, mean_over_environments, higher=higher)
-            for label, pair in both.items()]
+            for label, pair in pairs.items()]
     if score == "error":
         rows += [_row(f"all {kind} ({len(together)} environments)", SKILL_SCORE, together,
                       interquartile_mean, higher=True)
                  for kind, together in gains.items() if len(together) > 1]
-    elif len(both) > 1:
-        rows.append(_row("all", score, both, mean_over_environments, higher=higher))
-    return pd.DataFrame(rows, columns=list(COMPARISON_FIELDS))
+    elif len(pairs) > 1:
+        rows.append(_row("all", score, pairs, mean_over_environments, higher=higher))
+    return pd.DataFrame(rows)
 
 
 def _environment_and_split(record: dict[str, Any]) -> tuple[str, str]:
     return qualified_name(record["environment"]), record["split"]
 
 
-def _row(label: str, score: str, pairs: dict[str, Any], statistic: Statistic, *,
-         higher: bool) -> tuple[Any, ...]:
+def _row(label: str, score: str, pairs: dict[str, Pair], statistic: Statistic, *,
+         higher: bool) -> dict[str, Any]:
+    """Return a row of `compare`; ``pairs`` are environment -> scores of a and b by seed."""
     ours, theirs = ({name: pair[side] for name, pair in pairs.items()} for side in (0, 1))
-    means = [float(statistic(*[list(own.values()) for own in side.values()]))
-             for side in (ours, theirs)]
-    return (label, score, sum(map(len, ours.values())), *means,
-            *paired_difference(*((ours, theirs) if higher else (theirs, ours)),
-                               statistic=statistic),
-            *paired_probability_of_improvement(ours, theirs, higher_is_better=higher))
+    a, b = (float(statistic(*[list(own.values()) for own in side.values()]))
+            for side in (ours, theirs))
+    difference = paired_difference(*((ours, theirs) if higher else (theirs, ours)),
+                                   statistic=statistic)
+    better = paired_probability_of_improvement(ours, theirs, higher_is_better=higher)
+    return {"environment": label, "score": score, "episodes": sum(map(len, ours.values())),
+            "a": a, "b": b,
+            **dict(zip(("advantage", "low", "high"), difference, strict=True)),
+            **dict(zip(("better", "better_low", "better_high"), better, strict=True))}
 
 
 def display_names(a: dict[str, Any], b: dict[str, Any]) -> tuple[str, str]:
@@ -200,25 +191,21 @@ def display_names(a: dict[str, Any], b: dict[str, Any]) -> tuple[str, str]:
 def comparison_table(table: pd.DataFrame, a: str, b: str, score: str = "error") -> Table:
     """Return the comparison of methods named ``a`` and ``b``; column better has the name of the
     better one where the 95 % interval of the advantage of a excludes zero."""
-    asked = resolve_score(score)
     rows = []
     for row in table.to_dict("records"):
-        is_gain = row["score"] == SKILL_SCORE
-        three = format_interval(row["advantage"], row["low"], row["high"])
         share = f"{100 * row['better']:.0f} %"
         if math.isfinite(row["low"]):
             share += f" ({100 * row['better_low']:.0f} to {100 * row['better_high']:.0f} %)"
-        levels = {f"{asked.heading} of {name}": number_cell(row[key])
-                  for key, name in (("a", a), ("b", b))}
-        if is_gain:
-            levels = {key: cell._replace(text=f"{SKILL_SCORE} {cell.text}")
-                      for key, cell in levels.items()}
+        kind = f"{SKILL_SCORE} " * (row["score"] == SKILL_SCORE)
         rows.append({
             "environment": row["environment"].removeprefix("eitbench/"),
             "better": b if row["high"] < 0 else a if row["low"] > 0 else MISSING,
-            "episodes": Cell(str(row["episodes"]), float(row["episodes"])), **levels,
-            f"advantage of {a}": Cell(three, row["advantage"]),
-            f"{a} better": Cell(share, row["better"])})
+            "episodes": Cell(str(row["episodes"])),
+            **{f"{scores()[score].heading} of {name}": Cell(kind + format_number(row[key]))
+               for key, name in (("a", a), ("b", b))},
+            f"advantage of {a}":
+                Cell(format_interval(row["advantage"], row["low"], row["high"])),
+            f"{a} better": Cell(share)})
     return Table.of(rows, label="Comparison", keep=list(rows[0]))
 
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-import shlex
 import textwrap
 from collections.abc import Iterable
 from typing import Any, NamedTuple
@@ -12,11 +10,7 @@ from eitbench._sanitize import sanitize
 from eitbench.bench.run import Job
 from eitbench.bench.store import EpisodeStore
 from eitbench.bench.text import seed_ranges
-from eitbench.bench.variants import flatten, format_setting
 from eitbench.data.seeds import format_seed
-
-_METHOD_OPTIONS = {"estimation": "--baseline", "injection": "--policy"}
-"""Track -> the option of `eitbench run` that names its methods."""
 
 
 class Failure(NamedTuple):
@@ -60,23 +54,6 @@ def failures(store: EpisodeStore, records: Iterable[dict[str, Any]]) -> list[Fai
                 seeds.setdefault(error, []).append(episode["seed"])
         found += [Failure(record, those, *error) for error, those in seeds.items()]
     return found
-
-
-def debug_command(failure: Failure, jobs: Iterable[Job]) -> str:
-    """Return the command that runs the first of these episodes in its own process, without
-    isolation; empty if it is not among the jobs."""
-    first = failure.seeds[0]
-    failed = (failure.record["environment"]["name"], failure.record["method"], first)
-    for job in jobs:
-        if _key(job) == failed:
-            given = json.loads(job.environment.kwargs)
-            changes = [f"--set={number}={format_setting(value)}"
-                       for number, value in flatten(given.get("world", {})).items()]
-            estimator = ["--estimator", given["estimator"]] if "estimator" in given else []
-            return shlex.join(["eitbench", "run", "--env", job.environment.id,
-                               _METHOD_OPTIONS[job.environment.track], job.method, "--seeds", first,
-                               *changes, *estimator, "--isolate", "none", "--jobs", "1"])
-    return ""
 
 
 def _key(job: Job) -> tuple[str, str, str]:

@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from itertools import cycle
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
+import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import ListedColormap
@@ -49,49 +50,14 @@ def write_report(path: Path, env: MeasuredEnv, runs: Sequence[MeasuredRun],
     data-quality warnings, residuals by electrode, and, with a ``truth`` (256, 256) for
     `eitbench.measured.segmentation`, the segmentations."""
     source = dict(env.measurements.source)
-    calibration = env.calibration
     page = render_template(
         "measured.html.j2", root="", title=str(source.pop("file", "Measurements")), source=source,
-        methods=[(run.method, run.withheld_rmse, 1e3 * run.withheld_rmse_volts,
-                  run.mean_nis(env.task.warm_up)) for run in runs],
-        warnings=env.quality_warnings(),
-        facts=_facts(env), estimate=_estimate(env, runs[0]), first=runs[0].method,
-        over_time=_over_time(env, runs), velocity=_velocity(env, runs),
-        fit=_figure(_fit(env)), correction=CORRECTION_TEXT[calibration.correction],
-        contacts=_figure(_contacts(env)), electrodes=_figure(_electrodes(runs[0])),
-        at_rest=env.task.is_stationary, is_scored=env.withheld > 0.0,
+        env=env, runs=runs, percent=percent, estimate=_estimate(env, runs[0]),
+        over_time=_over_time(env, runs), velocity=_velocity(env, runs), fit=_figure(_fit(env)),
+        correction=CORRECTION_TEXT[env.calibration.correction], contacts=_figure(_contacts(env)),
+        electrodes=_figure(_electrodes(runs[0])),
         segmentation="" if truth is None else _figure(_segmentations(env, runs, truth)))
     write_atomically(path, page)
-
-
-def _facts(env: MeasuredEnv) -> dict[str, str]:
-    """Calibration and prior in words."""
-    calibration, measurements, task = env.calibration, env.measurements, env.task
-    contacts = 1e3 * calibration.contact_impedance
-    facts = {
-        "measurements": f"{len(measurements.injection_index)} times {len(measurements.matrix)}, of "
-                    f"{len(measurements.currents)} different injections",
-        "conductivity": f"{calibration.conductivity:.4g} S/m ± "
-                        f"{percent(calibration.conductivity_std)}",
-        "channel gain": f"{calibration.gain:.4g}",
-        "contact impedances": f"{contacts.min():.3g} to {contacts.max():.3g} mΩ·m²",
-        "noise of the instrument" if calibration.noise_from_repeats else "misfit of the model":
-            _noise(calibration.noise),
-        "noise in the task": _noise(task.noise)}
-    flow = env.vessel.flow
-    if flow is not None and not env.task.is_stationary:
-        spread = f"± {flow.velocity_std:.2g} m/s" if flow.is_estimated else "known"
-        return facts | {"flow": f"{flow.mean_velocity:.3g} m/s on average, {spread}"}
-    facts["initial state"] = (f"± {percent(task.prior.initial_std)} of the background, smooth "
-                              f"over {100 * task.prior.initial_length:.2g} cm")
-    if not env.task.is_stationary:
-        facts["random walk"] = (f"± {percent(task.prior.nodal_std)} of the background in a step "
-                                f"of {1e3 * task.transport.time_step:.3g} ms")
-    return facts
-
-
-def _noise(noise: Any) -> str:
-    return f"{percent(noise.relative)} of the measurement and {1e3 * noise.floor:.2g} mV"
 
 
 def _estimate(env: MeasuredEnv, run: MeasuredRun) -> str:
@@ -153,16 +119,18 @@ def _segmentations(env: MeasuredEnv, runs: Sequence[MeasuredRun], truth: np.ndar
 
 def _over_time(env: MeasuredEnv, runs: Sequence[MeasuredRun]) -> str:
     """Withheld residuals and NIS of each method, if there are any, as a data URI; else empty."""
-    frame = max(env.task.warm_up, 1)
-    curves = {"withheld residual / noise std": {
-        run.method: np.sqrt(_frame_means(run.withheld_residual_rms**2, frame)) for run in runs},
-        "NIS/m": {run.method: _frame_means(run.nis, frame) for run in runs}}
-    shown = [(label, own) for label, own in curves.items() if np.isfinite([*own.values()]).any()]
+    residuals = pd.DataFrame({run.method: run.withheld_residual_rms**2 for run in runs})
+    nis = pd.DataFrame({run.method: run.nis for run in runs})
+    residuals, nis = (each.rolling(max(env.task.warm_up, 1), center=True, min_periods=1).mean()
+                      for each in (residuals, nis))
+    shown = [(label, curves) for label, curves in (
+        ("withheld residual / noise std", residuals**0.5), ("NIS/m", nis))
+        if curves.notna().to_numpy().any()]
     if not shown:
         return ""
     figure, axes = _panels(len(shown), (10.5, 3.4))
-    for ax, (label, own) in zip(axes, shown, strict=True):
-        _plot(ax, env, own, label)
+    for ax, (label, curves) in zip(axes, shown, strict=True):
+        _plot(ax, env, curves, label)
         ax.axhline(1.0, color="0.7", linewidth=1)
         ax.set_yscale("log")
         ax.set_ylim(bottom=max(ax.get_ylim()[0], MIN_PLOTTED))
@@ -175,25 +143,17 @@ def _velocity(env: MeasuredEnv, runs: Sequence[MeasuredRun]) -> str:
     if env.task.velocity is None:
         return ""
     figure, (axes,) = _panels(1, (10.5, 2.8))
-    _plot(axes, env, {run.method: run.velocity[:, 0] for run in runs if run.velocity is not None},
-          "mean velocity / (m/s)")
+    _plot(axes, env, pd.DataFrame({run.method: run.velocity[:, 0] for run in runs
+                                   if run.velocity is not None}), "mean velocity / (m/s)")
     axes.legend(frameon=False, fontsize=9)
     return _figure(figure)
 
 
-def _plot(axes: Axes, env: MeasuredEnv, curves: dict[str, np.ndarray], label: str) -> None:
-    """Draw values (T,) of each method over time."""
+def _plot(axes: Axes, env: MeasuredEnv, curves: pd.DataFrame, label: str) -> None:
+    """Draw a column (T,) for each method over time."""
     for (method, values), colour in zip(curves.items(), cycle(LINE_COLOURS), strict=False):
         axes.plot(env.measurements.times, values, color=colour, label=method)
     axes.set(xlabel="time / s", ylabel=label)
-
-
-def _frame_means(values: np.ndarray, frame: int) -> np.ndarray:
-    """Moving averages over a frame of the finite values."""
-    known = np.isfinite(values)
-    weights = np.convolve(known.astype(float), np.ones(frame), "same")
-    total = np.convolve(np.where(known, values, 0.0), np.ones(frame), "same")
-    return np.where(weights > 0, total / np.maximum(weights, 1.0), np.nan)
 
 
 def _fit(env: MeasuredEnv) -> Figure:

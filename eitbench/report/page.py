@@ -43,7 +43,7 @@ def write_page(store: EpisodeStore, boards: Sequence[Leaderboard],
     sections = [{
         "title": board.title,
         "about": tables.run_title(board).removeprefix(f"{board.title}, "),
-        "table": table, "axes": tables.ScoreAxes.of(board).headers(),
+        "table": table, "axes": tables.score_axes(board),
         "curves": tables.curve_chart(board), "snapshots": _snapshots(store, board),
         "failures": [(failure.record["title"], seed_ranges(failure.seeds), failure.message,
                       failure.traceback) for failure in failures(store, board.records)],

@@ -145,24 +145,21 @@ def compare(table: pd.DataFrame | Iterable[pd.DataFrame], ax: Axes | None = None
     _check.choice("score", score, [name for name in rows if name in scores()])
     several = rows["environment"].nunique() > 1
     names = rows["method"] + (", " + rows["environment"] if several else "")
-    values = {str(name): own.dropna().astype(float).to_numpy()
-              for name, own in rows[score].groupby(names)}
-    values = {name: own for name, own in values.items() if len(own)}
-    if not values:
-        raise ValueError(f"table must have a method with the score {score}, got none")
     asked = scores()[score]
-    sign = -1.0 if asked.direction == "higher" else 1.0
-    order = sorted(values, key=lambda name: -sign * values[name].mean())
+    values = (asked.factor * rows[score].dropna().astype(float)).groupby(names)
+    order = values.mean().sort_values(ascending=asked.direction == "higher").index
+    if order.empty:
+        raise ValueError(f"table must have a method with the score {score}, got none")
     if ax is None:
         import matplotlib.pyplot as plt
         ax = plt.subplots(figsize=(6.4, 1.2 + 0.4 * len(order)), layout="constrained")[1]
     for place, name in enumerate(order):
-        own = asked.factor * values[name]
+        own = values.get_group(name)
         mean, half = mean_and_interval(list(own))
         ax.plot(own, np.full(len(own), place + 0.2), "o", color="#2e86ab", markersize=4)
         ax.errorbar(mean, place, xerr=half if np.isfinite(half) else None, fmt="o", color="#1b4965",
                     capsize=4, markersize=6)
-    if min(own.min() for own in values.values()) > 0:
+    if values.min().min() > 0:
         ax.set_xscale("log")
         ax.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
         ax.xaxis.set_major_formatter(lambda value, place: f"{value:g}")

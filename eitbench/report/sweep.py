@@ -55,9 +55,8 @@ class Sweep(NamedTuple):
                   for i, (method, each) in enumerate(self.errors.items()) if any(each)]
         if not series:
             return None
-        svg = charts.line_chart(x, series, self.parameter, "relative error ẽ_c",
-                           log=bool(x[0] > 0 and x[-1] >= 8 * x[0]))
-        return charts.Chart(svg, charts.legend(series))
+        return charts.line_chart(x, series, self.parameter, "relative error ẽ_c",
+                                 log=bool(x[0] > 0 and x[-1] >= 8 * x[0]))
 
 
 def _mean(errors: list[float]) -> float:

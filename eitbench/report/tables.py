@@ -7,12 +7,10 @@ import math
 import re
 from collections import Counter
 from collections.abc import Iterable, Sequence
-from typing import NamedTuple
 from urllib.parse import quote
 
 import numpy as np
 import pandas as pd
-from markupsafe import Markup
 
 from eitbench._sanitize import escape_markdown
 from eitbench.bench.statistics import agent_name, mean_by_seed
@@ -49,15 +47,7 @@ BADGES = {"floor": "naive baseline", "reference": "oracle"}
 # -- trainings -------------------------------------------------------------------------------------
 
 
-class AgentRow(NamedTuple):
-    """One method, or all trainings of an agent."""
-
-    row: MethodRow
-    parts: list[MethodRow]
-    """Trainings, the best first; empty unless there are several."""
-
-
-def group_by_agent(board: Leaderboard) -> list[AgentRow]:
+def group_by_agent(board: Leaderboard) -> list[MethodRow]:
     """Return the rows of a leaderboard in its order, training seeds of an agent grouped.
 
     Agents with at least two ranked training seeds become one row: the mean over these seeds, with
@@ -67,15 +57,15 @@ def group_by_agent(board: Leaderboard) -> list[AgentRow]:
     for row in board.rows:
         if not row.has_no_rank:
             groups.setdefault(row.agent, []).append(row)
-    together = [AgentRow(_agent_mean(board, rows), rows) for rows in groups.values()
-                if sum(row.is_ranked for row in rows) > 1]
-    grouped = {row.label for line in together for row in line.parts}
-    together += [AgentRow(row, []) for row in board.rows if row.label not in grouped]
-    return sorted(together, key=lambda line: line.row.place())
+    means = [_agent_mean(board, rows) for rows in groups.values()
+             if sum(row.is_ranked for row in rows) > 1]
+    grouped = {row.label for mean in means for row in mean.trainings}
+    return sorted(means + [row for row in board.rows if row.label not in grouped],
+                  key=MethodRow.place)
 
 
 def _agent_mean(board: Leaderboard, rows: list[MethodRow]) -> MethodRow:
-    """Return the line of an agent."""
+    """Return the mean of the trainings of an agent."""
     ranked = [row for row in rows if row.is_ranked]
     first, unfinished = ranked[0], len(rows) - len(ranked)
     frame = pd.DataFrame([row.cells for row in ranked])
@@ -85,7 +75,7 @@ def _agent_mean(board: Leaderboard, rows: list[MethodRow]) -> MethodRow:
     errors = mean_by_seed([episode_errors(row.record) for row in ranked])
     if errors:
         cells |= error_and_skill(errors, episode_errors(naive_baseline_record(board.records)))
-    return first._replace(record=None, cells=cells | {
+    return first._replace(record=None, trainings=tuple(rows), cells=cells | {
         "method": agent_name(first.cells["method"]),
         "note": f"{unfinished} of {len(rows)} unfinished" if unfinished else "",
         "title": re.sub(r" trained with seed \d+$", "", first.cells["title"]),
@@ -95,55 +85,44 @@ def _agent_mean(board: Leaderboard, rows: list[MethodRow]) -> MethodRow:
 # -- cells -----------------------------------------------------------------------------------------
 
 
-class ScoreAxes(NamedTuple):
-    """Axes of interval columns, with a line at the naive baseline."""
-
-    axes: dict[str, charts.Axis]
-    marks: dict[str, float | None]
-
-    @classmethod
-    def of(cls, board: Leaderboard) -> ScoreAxes:
-        """Return the axes that the rows of a board share."""
-        floor = naive_baseline_record(board.records)
-        zero = next((row.cells["error"] for row in board.rows
-                     if floor and row.record is floor), None)
-        return cls({name: _axis_range(board.rows, name) for name in INTERVAL_HEADINGS},
-                   {"error": zero, "gain": 0.0})
-
-    def cell(self, row: MethodRow, name: str, parts: Sequence[MethodRow] = ()) -> Cell:
-        """Return a score with its interval, drawn and as text, and the range of seeds."""
-        value, low, high = row.interval(name)
-        if math.isnan(value):
-            return Cell(MISSING)
-        text, _, interval = format_interval(value, low, high).partition(" ")
-        each = sorted(part.cells[name] for part in parts if part.is_ranked)
-        if each:
-            spread = format_interval(value, each[0], each[-1]).partition(" ")[2].strip("()")
-            interval += f"; seeds {spread or format_number(value)}"
-        drawn = charts.sparkline((value, low, high), self.axes[name], mark=self.marks[name],
-                                 each=each)
-        return Cell(text, value, drawn, note=interval.strip())
-
-    def cells(self, row: MethodRow, parts: Sequence[MethodRow] = ()) -> dict[str, Cell]:
-        """Return heading -> cell of each score with an interval."""
-        return {heading: self.cell(row, name, parts) for name, heading in INTERVAL_HEADINGS.items()}
-
-    def headers(self) -> dict[str, Markup]:
-        """Return heading -> the axis of its column, as SVG."""
-        return {heading: charts.sparkline_axis(self.axes[name], mark=self.marks[name])
-                for name, heading in INTERVAL_HEADINGS.items()}
+def score_axes(board: Leaderboard) -> dict[str, charts.Axis]:
+    """Return heading -> axis of each score with an interval, which the rows of a board share, with
+    a mark at the naive baseline: linear for skill scores, cut at `SKILL_AXIS_MIN`, otherwise
+    logarithmic."""
+    floor = naive_baseline_record(board.records)
+    zero = next((row.cells["error"] for row in board.rows if floor and row.record is floor), None)
+    axes = {}
+    for name, heading in INTERVAL_HEADINGS.items():
+        is_gain = name == "gain"
+        ends = [end for row in board.rows for end in row.interval(name) if math.isfinite(end)]
+        if is_gain:
+            low, high = max(min([0.0, *ends]), SKILL_AXIS_MIN), 1.0
+        else:
+            positive = [end for end in ends if end > 0] or [1.0]
+            low, high = min(positive), max(positive)
+        axes[heading] = charts.Axis(low, high, 4, charts.CELL_WIDTH_PX - 4, log=not is_gain,
+                                    mark=0.0 if is_gain else zero)
+    return axes
 
 
-def _axis_range(rows: Iterable[MethodRow], name: str) -> charts.Axis:
-    """Return the axis that holds all intervals of a column: linear for skill
-    scores, cut at `SKILL_AXIS_MIN`, otherwise logarithmic."""
-    ends = [end for row in rows for end in row.interval(name) if math.isfinite(end)]
-    if name == "gain":
-        low, high = max(min([0.0, *ends]), SKILL_AXIS_MIN), 1.0
-    else:
-        positive = [end for end in ends if end > 0] or [1.0]
-        low, high = min(positive), max(positive)
-    return charts.Axis(low, high, 4, charts.CELL_WIDTH_PX - 4, log=name != "gain")
+def _interval_cells(row: MethodRow, axes: dict[str, charts.Axis]) -> dict[str, Cell]:
+    """Return heading -> cell of each score with an interval."""
+    return {heading: interval_cell(row, name, axes[heading])
+            for name, heading in INTERVAL_HEADINGS.items()}
+
+
+def interval_cell(row: MethodRow, name: str, axis: charts.Axis) -> Cell:
+    """Return a score with its interval, drawn and as text, and the range of training seeds."""
+    value, low, high = row.interval(name)
+    if math.isnan(value):
+        return Cell(MISSING)
+    text, _, interval = format_interval(value, low, high).partition(" ")
+    each = sorted(part.cells[name] for part in row.trainings if part.is_ranked)
+    if each:
+        spread = format_interval(value, each[0], each[-1]).partition(" ")[2].strip("()")
+        interval += f"; seeds {spread or format_number(value)}"
+    drawn = charts.sparkline((value, low, high), axis, each)
+    return Cell(text, value, drawn, note=interval.strip())
 
 
 def _number_cells(row: MethodRow, names: Iterable[str]) -> dict[str, Cell]:
@@ -158,15 +137,14 @@ def _rank_cell(row: MethodRow, shared: Counter[int | None]) -> Cell:
     return Cell(f"{rank}", float(rank), note="tied" if shared[rank] > 1 else "")
 
 
-def method_cell(row: MethodRow, root: str, parts: Sequence[MethodRow] = (),
-                more: Iterable[str] = ()) -> Cell:
+def method_cell(row: MethodRow, root: str, more: Iterable[str] = ()) -> Cell:
     """Return title, name and badges of a method, linked to its page or with its training seeds;
     ``more`` are further badges."""
     title = row.cells["title"]
     badges = (*(BADGES.get(word, word) for word in row.badges), *more)
-    if parts:
-        return Cell(title, title.casefold(), note=f"mean of {len(parts)} training seeds",
-                    badges=badges)
+    if row.trainings:
+        return Cell(title, title.casefold(), badges=badges,
+                    note=f"mean of {len(row.trainings)} training seeds")
     return Cell(title, title.casefold(), note=row.label, badges=badges,
                 link=f"{root}methods/{quote(row.cells['method'])}.html")
 
@@ -186,32 +164,32 @@ def filter_flags(row: MethodRow) -> str:
 
 def page_table(board: Leaderboard, root: str, *, compact: bool = False) -> Table:
     """Return a board for a page; ``root`` leads from the page to the site's folder."""
-    axes = ScoreAxes.of(board)
+    axes = score_axes(board)
     together = group_by_agent(board)
     outperformed = _beaten_oracles(together)
-    shared = Counter(line.row.cells["rank"] for line in together)
+    shared = Counter(row.cells["rank"] for row in together)
 
-    def cells(row: MethodRow, parts: Sequence[MethodRow] = ()) -> dict[str, Cell]:
+    def cells(row: MethodRow) -> dict[str, Cell]:
         more = [*outperformed.get(row.label, ()), *author_badges(row)]
-        return {"rank": _rank_cell(row, shared), "method": method_cell(row, root, parts, more),
-                **axes.cells(row, parts),
+        return {"rank": _rank_cell(row, shared), "method": method_cell(row, root, more),
+                **_interval_cells(row, axes),
                 **_number_cells(row, INDEX_COLUMNS if compact else headings())}
 
     def part(row: MethodRow) -> TableRow:
         own = cells(row)
         return TableRow([own[heading] for heading in made.headings], filter_flags(row))
 
-    made = Table.of((cells(*line) for line in together), label=board.title, keep=["rank"],
-                    flags=[filter_flags(line.row) for line in together])
-    return made._replace(rows=[row._replace(children=tuple(map(part, line.parts)))
-                               for row, line in zip(made.rows, together, strict=True)])
+    made = Table.of(map(cells, together), label=board.title, keep=["rank"],
+                    flags=list(map(filter_flags, together)))
+    return made._replace(rows=[line._replace(children=tuple(map(part, row.trainings)))
+                               for line, row in zip(made.rows, together, strict=True)])
 
 
-def _beaten_oracles(together: list[AgentRow]) -> dict[str, list[str]]:
+def _beaten_oracles(together: list[MethodRow]) -> dict[str, list[str]]:
     """Return label of an oracle -> a note that ranked methods have a smaller error."""
     found = {}
     before: list[str] = []
-    for row, _ in together:
+    for row in together:
         if row.is_ranked:
             before.append(row.cells["title"])
         elif before and "reference" in row.badges:
@@ -222,10 +200,11 @@ def _beaten_oracles(together: list[AgentRow]) -> dict[str, list[str]]:
 
 def markdown_table(board: Leaderboard) -> Table:
     """Return a board as text: one row for each record."""
-    axes = ScoreAxes.of(board)
+    axes = score_axes(board)
     shared = Counter(row.cells["rank"] for row in board.rows)
     return Table.of([{
-        "rank": _rank_cell(row, shared), "method": method_cell(row, ""), **axes.cells(row),
+        "rank": _rank_cell(row, shared), "method": method_cell(row, ""),
+        **_interval_cells(row, axes),
         "run by": "".join(author_badges(row)) or "official",
         **_number_cells(row, headings())} for row in board.rows], keep=["rank"])
 
@@ -238,7 +217,7 @@ def run_table(board: Leaderboard, *, title: str = "title", drawn: bool = False) 
     column if they differ. Policies have the paired difference of their error to the error of the
     best policy without privileged information.
     """
-    axes = ScoreAxes.of(board)
+    axes = score_axes(board)
     best = next((row for row in board.rows if row.complete and "privileged" not in row.badges),
                 None) if board.category == "injection" and len(board.rows) > 1 else None
     seeds = run_seeds(board)
@@ -257,7 +236,7 @@ def run_table(board: Leaderboard, *, title: str = "title", drawn: bool = False) 
             residuals = scores_by_seed(row.record, "prediction_error") if row.record else {}
             cells[columns()["prediction_error"][0]] = mean_cell(residuals.values())
         elif drawn:
-            cells |= axes.cells(row)
+            cells |= _interval_cells(row, axes)
         else:
             cells["ẽ_c"] = mean_cell(episode_errors(row.record).values())
         if best:
@@ -334,14 +313,12 @@ def cost_chart(board: Leaderboard) -> charts.Chart | None:
     None without data."""
     points = [charts.ParetoPoint(row.cells["title"], row.colour, row.cells["seconds_per_step"],
                            row.cells["error"], row.is_ranked)
-              for row, _ in group_by_agent(board)
+              for row in group_by_agent(board)
               if row.cells["error"] is not None and row.cells["seconds_per_step"]]
     if not points:
         return None
-    best = ", ".join(point.name for point in charts.pareto_front(points))
-    svg = charts.pareto_chart(points, "computing time per step on one core, ms",
-                              "relative error ẽ_c")
-    return charts.Chart(svg, charts.legend(points), f": {best}" if best else "")
+    return charts.pareto_chart(points, "computing time per step on one core, ms",
+                               "relative error ẽ_c")
 
 
 def curve_chart(board: Leaderboard) -> charts.Chart | None:
@@ -358,9 +335,7 @@ def curve_chart(board: Leaderboard) -> charts.Chart | None:
     series = [charts.Series(row.cells["title"], row.colour, errors, faint=row not in strong)
               for row, errors in found]
     steps = np.arange(1, max(len(each.values) for each in series) + 1)
-    svg = charts.line_chart(steps, series, "scored state", "relative squared error")
-    return charts.Chart(svg, charts.legend(each for each in series if not each.faint),
-                        " Thin lines: all other methods." if len(strong) < len(found) else "")
+    return charts.line_chart(steps, series, "scored state", "relative squared error")
 
 
 def _highlighted_rows(rows: list[MethodRow]) -> list[MethodRow]:

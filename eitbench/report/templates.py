@@ -5,7 +5,7 @@ from __future__ import annotations
 import base64
 import io
 import re
-from collections.abc import Mapping
+from collections.abc import Callable
 from functools import lru_cache
 from typing import Any
 from urllib.parse import quote
@@ -15,7 +15,7 @@ from markdown_it import MarkdownIt
 from markupsafe import Markup, escape
 from PIL import Image
 
-from eitbench._sanitize import sanitize
+from eitbench._sanitize import escape_markdown, sanitize
 
 _DRAWING = ('<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 32 32">'
             '<rect y="5" width="32" height="22" rx="5" fill="#0b6e75"/>'
@@ -23,6 +23,10 @@ _DRAWING = ('<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 32 32">'
             '</svg>')
 ICON = f"data:image/svg+xml,{quote(_DRAWING, safe='')}"
 """Icon of the browser's tab: a pipe with a slug."""
+
+
+N_COLOURS = 12
+"""--c0 … --c11 of the style sheet; further series repeat them, dashed."""
 
 
 def render_template(name: str, /, **contents: Any) -> bytes:
@@ -35,8 +39,21 @@ def _environment() -> jinja2.Environment:
     made = jinja2.Environment(loader=jinja2.PackageLoader("eitbench.report", "."), autoescape=True,
                               trim_blocks=True, lstrip_blocks=True, keep_trailing_newline=True,
                               undefined=jinja2.StrictUndefined, finalize=_finalize)
-    made.globals |= {"add_line_breaks": add_line_breaks, "icon": ICON}
+    made.globals |= {"add_line_breaks": add_line_breaks, "icon": ICON, "n_colours": N_COLOURS}
+    made.filters |= {"tick": format_tick, "escape_markdown": escape_markdown}
     return made
+
+
+def macro(name: str) -> Callable[..., Markup]:
+    """Return a macro of the template of charts."""
+    drawing = _environment().get_template("charts.svg.j2").module
+    found: Callable[..., Markup] = getattr(drawing, name)
+    return found
+
+
+def format_tick(tick: float) -> str:
+    """``200,000`` and ``0.002``, never ``2e+05``."""
+    return f"{tick:,.0f}" if abs(tick) >= 1e4 else f"{tick:g}"
 
 
 def _finalize(value: Any) -> Any:
@@ -64,11 +81,6 @@ def markdown(text: str) -> Markup:
     html = reader.renderer.render(tokens, reader.options, {})
     begin = '<div class="card" tabindex="0" role="region" aria-label="table"><table>'
     return Markup(html.replace("<table>", begin).replace("</table>", "</table></div>"))
-
-
-def markdown_list(texts: Mapping[str, str]) -> str:
-    """Return a list of terms and their explanations as Markdown."""
-    return "\n".join(f"- **{name}**: {text}" for name, text in texts.items())
 
 
 def data_uri(image: Image.Image, kind: str = "png", **options: Any) -> str:

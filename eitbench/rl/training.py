@@ -44,7 +44,6 @@ from tqdm import tqdm
 
 from eitbench import _check
 from eitbench._files import resolve_input, write_atomically
-from eitbench.data.cache import npy
 from eitbench.data.seeds import SPLITS
 from eitbench.envs.injection import InjectionEnv, InjectionVectorEnv
 from eitbench.rl.imitation import check_imitation, imitate, load_compatible_policy, rollout
@@ -193,7 +192,7 @@ def train(env: str, algo: str, config: TrainingConfig, seed: int, folder: Path,
     learning.results_writer = ResultsWriter(
         str(folder / f"{start}.monitor.csv"), header={"t_start": learning.t_start, "env_id": env})
     if config.reference:
-        inner.reference = policy_rewards(config.reference, world, folder / "reference.npy")
+        inner.reference = policy_rewards(config.reference, world)
     if is_new:
         if config.imitate:
             imitate(model, world, config.imitate, config.reward_scale, inner.reference, seed)
@@ -209,7 +208,6 @@ def train(env: str, algo: str, config: TrainingConfig, seed: int, folder: Path,
     write_atomically(folder / "sha256", hashlib.sha256(made.read_bytes()).hexdigest().encode())
     latest.unlink()
     learning.close()
-    (folder / "reference.npy").unlink(missing_ok=True)
     return made
 
 
@@ -227,17 +225,13 @@ def vector_env(env: str, kwargs: dict[str, Any] | None, config: TrainingConfig,
     return made
 
 
-def policy_rewards(policy: str, world: InjectionEnv, path: Path) -> np.ndarray:
-    """Compute or load from ``path`` the rewards (episodes, steps) of a policy in training."""
-    if path.exists():
-        return np.asarray(np.load(path))
+def policy_rewards(policy: str, world: InjectionEnv) -> np.ndarray:
+    """Compute the rewards (episodes, steps) of a policy in the training episodes."""
     method = load_compatible_policy("reference", policy, world.rules)
-    rewards = np.array([
+    return np.array([
         rollout(world, method, episode, np.random.default_rng(episode))[2]
         for episode in tqdm(range(world.pool.max_episodes), desc=f"rewards of {policy}",
                             unit="episode", disable=None)])
-    write_atomically(path, npy(rewards))
-    return rewards
 
 
 def make_evaluator(env: str, kwargs: dict[str, Any] | None,

@@ -55,7 +55,8 @@ def injection(seeds: list[int] | None, jobs: int, out: Path) -> tuple[Path, str]
         run_jobs(pending_jobs(todo, recorded), store, n_jobs=jobs,
                  command="python studies/thesis injection")
         rows = policy_rows(todo, [*recorded, *store.results()])
-        privileged = sorted({job.load().name for job in todo if job.load().privileged})
+        methods = [job.load() for job in {job.method: job for job in todo}.values()]
+        privileged = sorted({method.name for method in methods if method.privileged})
         _scores(axes, rows, privileged)
         axes.set_title(title, fontsize=11)
         means = errors_by_policy(rows).agg(["mean", "std", "count"]).T

@@ -41,12 +41,11 @@ def module(tmp_path, monkeypatch):
     gym.registry.pop("mine/Fast-v0", None)
 
 
-@pytest.mark.parametrize("isolate", ["none", "process"])
-def test_a_world_of_a_file_runs(module, isolate, tmp_path):
+def test_a_world_of_a_file_runs(module, tmp_path):
     """On two processes, and in a worker of an isolated method."""
     mine = write_baseline(tmp_path)
     code, said, complaint = eitbench("run", "--env", f"{module}:mine/Fast-v0", "--baseline", mine, "--seeds", "dev:0-1",
-                                     "-j", "2", "--isolate", isolate)
+                                     "-j", "2", "--isolate", "process")
     assert code == 0 and "Fast-v0" in said and "failed" not in said, complaint
 
 

@@ -1,5 +1,6 @@
 """Wheels of eitbench and the example, built once and installed outside the checkout."""
 
+import json
 import os
 import subprocess
 import sys
@@ -10,6 +11,17 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[2]
+ONE_PROCESS = """
+import json, sys
+
+from eitbench.cli.app import app
+from typer.testing import CliRunner
+
+for words, expected in json.loads(sys.argv[1]):
+    done = CliRunner().invoke(app, words)
+    assert done.exit_code == 0 and expected in done.output, (words, done.output, done.exception)
+"""
+"""Script that runs all commands in one process, which imports and compiles once."""
 
 
 @pytest.fixture(scope="session")
@@ -34,7 +46,11 @@ def installed(tmp_path_factory):
         assert done.returncode == code, done.stdout + done.stderr
         return done.stdout if code == 0 else done.stderr
 
-    run.folder = folder
+    def commands(pairs, cwd=folder):
+        """Run commands in their order and check a part of their outputs."""
+        run("-c", ONE_PROCESS, json.dumps([(list(map(str, words)), expected) for words, expected in pairs]), cwd=cwd)
+
+    run.folder, run.commands = folder, commands
     where = run("-c", "import eitbench; print(eitbench.__file__)").strip()
     assert Path(where).is_relative_to(folder)
     return run

@@ -8,7 +8,7 @@ from xml.etree import ElementTree
 class Page(HTMLParser):
     """Parse tags with attributes, and text, of a page; raise an error for unbalanced tags."""
 
-    VOID = ("meta", "img", "br", "link", "wbr", "input")
+    VOID = ("meta", "img", "br", "link", "wbr", "input", "source")
 
     def __init__(self, html):
         super().__init__()

@@ -124,7 +124,7 @@ def test_records_are_found_by_name_version_and_file(tmp_path, monkeypatch):
     monkeypatch.setattr(comparison, "BUNDLED_RECORDS", tmp_path)
     a, (b, _) = two_methods()
     paths = [write_record(tmp_path, each) for each in [*a, b]]
-    assert find_records("a", tmp_path) == a and find_records(f"a@{sha('a1')[:4]}", tmp_path) == a
+    assert find_records("a", tmp_path) == a and find_records(f"a@{sha('a1')[:8]}", tmp_path) == a
     assert find_records(str(paths[2]), tmp_path / "nowhere") == [b]
     write_record(tmp_path, newer := record("a", [0.1], version="2"))
     with pytest.raises(ValueError, match=rf"a fits several versions: a@{sha('a2')[:8]}, a@{sha('a1')[:8]}"):
@@ -138,7 +138,7 @@ def test_records_are_found_by_name_version_and_file(tmp_path, monkeypatch):
     assert find_records("c", tmp_path) == ours[1:] and find_records("c@v1", tmp_path) == ours[:1]
     write_record(tmp_path, tenth := record("c", [0.1], version="v10"))
     assert find_records("c@v1", tmp_path) == ours[:1] and find_records("c", tmp_path) == [tenth]
-    for nobody in ("d", "c@v", f"a@{sha('a1')[:3]}"):                # four digits are sufficient
+    for nobody in ("d", "c@v"):
         with pytest.raises(ValueError, match=f"record of {nobody} "):
             find_records(nobody, tmp_path)
 

@@ -139,7 +139,7 @@ def test_odd_values_can_be_drawn(values):
     points = [charts.ParetoPoint("p", 0, value, value) for value in values]
     for drawn in (charts.line_chart(np.arange(1, 1 + len(values)), series, "step", "error"),
                   charts.pareto_chart(points, "ms", "error")):
-        chart = ElementTree.fromstring(drawn)
+        chart = ElementTree.fromstring(drawn.svg)
         width, height = (float(x) for x in chart.get("viewBox").split()[2:])
         marks = [(float(mark.get("cx")), float(mark.get("cy"))) for mark in chart.iter("circle")]
         marks += [tuple(map(float, point.split(","))) for line in chart.iter("polyline")
@@ -153,7 +153,7 @@ def test_the_front_has_the_methods_that_no_other_beats():
         ("good", 9.0, 1.0, True), ("fast", 1.0, 5.0, True), ("beaten", 9.0, 5.0, True), ("between", 3.0, 2.0, True),
         ("same time, worse", 1.0, 6.0, True), ("floor", 0.1, 0.5, False)])]
     assert [point.name for point in charts.pareto_front(points)] == ["fast", "between", "good"]
-    chart = ElementTree.fromstring(charts.pareto_chart(points, "ms", "error"))
+    chart = ElementTree.fromstring(charts.pareto_chart(points, "ms", "error").svg)
     assert len(chart.findall("circle")) == 6
     assert len(chart.find("polyline[@class='front']").get("points").split()) == 3
 

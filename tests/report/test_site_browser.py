@@ -28,6 +28,10 @@ ENVIRONMENT, METHOD = "environments/eitbench-Pipe2D-v0.html", "methods/a.html"
 """One page of each kind, besides the index."""
 DARK = "--blink-settings=preferredColorScheme=0"
 STILL = "--force-prefers-reduced-motion"
+OPEN_TRAININGS = f"""
+        const parts = () => shown("{AGENTS} tr.part").length, before = parts();
+        one("{AGENTS} summary").click();
+        found.trainings = [all("{AGENTS} summary").length, before, parts()];"""
 HARNESS = """<body><iframe id="frame" style="width: {width}px; height: 900px; border: 0"></iframe><script>
 const frame = document.getElementById("frame"), errors = [];
 const one = (selector) => frame.contentDocument.querySelector(selector);
@@ -93,45 +97,72 @@ def folder(tmp_path_factory):
     return made
 
 
-def test_sort_by_columns(folder):
-    """Tables sort up, down, and by another column; rows without a value stay last; aria-sort names the order."""
+def test_sort_filter_and_explain(folder):
+    """Tables sort up, down, and by another column, rows without a value last; aria-sort names the order. Text filters
+    methods and environments, each box hides one kind, and a count shows the remaining rows. Column descriptions open by
+    pointer and keyboard; Escape closes them. Training seeds expand; they are sorted and filtered as one row."""
     found = answer(folder / "index.html", f"""
         const cells = (k) => shown("{BOARD} tbody tr").map((row) => row.cells[k].textContent.trim());
-        const sorts = () => all("{BOARD} th").map((cell) => cell.ariaSort).filter(Boolean);
+        const names = () => cells(1), found = {{order: []}};
         const heads = all("{BOARD} thead th"), time = heads.findIndex((cell) => cell.textContent === "ms/step");
-        const names = cells(1), found = [];
+        const first = names().sort().join();
         for (const column of [time, time, 0]) {{
           heads[column].querySelector("button").click();
-          found.push([cells(column), sorts()]);
+          found.order.push([cells(column), heads.map((cell) => cell.ariaSort).filter(Boolean)]);
         }}
-        return {{found, same: names.sort().join() === cells(1).sort().join()}};""")
-    (up, ascending), (down, descending), (ranks, third) = found["found"]
+        found.same = first === names().sort().join();
+
+        const header = heads[3], button = header.querySelector("button"), tips = found.tips = [];
+        const tip = () => tips.push(one(".tip:popover-open")?.textContent ?? null);
+        button.focus({{focusVisible: true}});
+        tip();
+        tips.push(button.ariaDescription);
+        button.dispatchEvent(new KeyboardEvent("keydown", {{key: "Escape"}}));
+        tip();
+        for (const kind of ["mouseenter", "mouseleave"]) {{
+          header.dispatchEvent(new MouseEvent(kind));
+          tip();
+        }}
+
+        {OPEN_TRAININGS}
+        one("{AGENTS} thead th:nth-child(2) button").click();
+        found.agents = all("{AGENTS} tbody tr").map((row) => row.cells[1].textContent);
+        type("ppo_seed1");
+        found.one = one("output").textContent;
+
+        found.every = cells(1).length;
+        type("TWIN tank");
+        found.count = one("output").textContent;
+        found.blocks = shown(".block").map((block) => block.id);
+        found.injection = one("#class-injection").checkVisibility();
+        type("");
+        found.again = names();
+        one("input[name=unranked]").click();
+        found.ranked = names().join(" ");
+        one("input[name='self-reported']").click();
+        found.official = names();
+        return found;""", STILL)
+    (up, ascending), (down, descending), (ranks, third) = found["order"]
     times = list(map(float, up))
     assert times == sorted(times) and list(map(float, down)) == times[::-1] and found["same"]
     assert (ascending, descending, third) == (["ascending"], ["descending"], ["ascending"])
     known = [int(re.match(r"\d+", rank)[0]) for rank in ranks if rank != "–"]
     assert known == sorted(known) and ranks[len(known):] == ["–"] * (len(ranks) - len(known)) and "–" in ranks
-
-
-def test_filter_by_words_and_by_kind(folder):
-    """Text filters methods and environments; each box hides one kind; a count shows the remaining rows."""
-    found = answer(folder / "index.html", f"""
-        const names = () => shown("{BOARD} tbody tr").map((row) => row.cells[1].textContent);
-        const every = names().length;
-        type("TWIN tank");
-        const count = one("output").textContent, blocks = shown(".block").map((block) => block.id);
-        const injection = one("#class-injection").checkVisibility();
-        type("");
-        const again = names().length;
-        one("input[name=unranked]").click();
-        const ranked = names().join(" ");
-        one("input[name='self-reported']").click();
-        return {{every, count, blocks, injection, again, ranked, official: names()}};""")
+    tips = found["tips"]
+    assert tips[0].startswith("1 − ẽ_c") and tips == [tips[0], tips[0], None, tips[0], None]
+    assert found["trainings"] == [1, 0, 2] and found["one"].startswith("1 of")
+    assert [re.findall("seed.(?=@)", name) for name in found["agents"] if "ppo" in name.lower()] == [
+        [], ["seed0"], ["seed1"]]
     assert found["count"].startswith("1 of ") and found["blocks"] == ["board-filter-eitbench-RotatingTank2D-v0"]
-    assert not found["injection"] and found["every"] == found["again"]
+    assert not found["injection"] and found["every"] == 0 and len(found["again"]) == len(ranks)
     assert not re.search("floor|reference", found["ranked"]) and "failing" in found["ranked"]
     (official,) = found["official"]
     assert "twin" in official
+
+
+def test_trainings_open_without_scripts(folder):
+    assert answer(folder / "index.html", f"const found = {{}}; {OPEN_TRAININGS} return found.trainings;",
+                  scripts=False) == [1, 0, 2]
 
 
 def test_dark_by_preference_and_by_choice(folder):
@@ -152,54 +183,29 @@ def test_dark_by_preference_and_by_choice(folder):
     assert light == [paper, words[0], ink, words[1], ink] and dark == [ink, words[1], paper, words[0], paper]
 
 
-@pytest.mark.parametrize("page", ["index.html", ENVIRONMENT, METHOD])
-@pytest.mark.parametrize("width", [380, 1200])
-def test_nothing_overflows(folder, page, width):
-    """Wide content scrolls within its container, which the keyboard reaches."""
-    full, contained, wide = answer(folder / page, """
-        all("details").forEach((details) => { details.open = true; });
-        return [frame.contentDocument.documentElement.scrollWidth,
-          all("table, pre, figure > div > svg").every(
-            (it) => it.closest('.card[tabindex="0"][role=region][aria-label]')),
-          all(".card").some((card) => card.scrollWidth > card.clientWidth)];""", width=width)
-    assert full == width and contained and (wide or width > 380)
-
-
-def test_headings_explain_themselves(folder):
-    """Column descriptions open by pointer and keyboard; Escape closes them."""
-    tips = answer(folder / "index.html", f"""
-        const header = one("{BOARD} thead th:nth-child(4)"), button = header.querySelector("button");
-        const tip = () => one(".tip:popover-open")?.textContent ?? null;
-        button.focus({{focusVisible: true}});
-        const found = [tip(), button.ariaDescription];
-        button.dispatchEvent(new KeyboardEvent("keydown", {{key: "Escape"}}));
-        found.push(tip());
-        for (const kind of ["mouseenter", "mouseleave"]) {{
-          header.dispatchEvent(new MouseEvent(kind));
-          found.push(tip());
+def test_nothing_overflows(folder, tmp_path):
+    """Wide content scrolls within its container, which the keyboard reaches: site and results page, which is
+    sortable like the site, on a phone and a desk."""
+    report = write_page(EpisodeStore(tmp_path), run_leaderboards(widest()))
+    pages = [folder / "index.html", folder / ENVIRONMENT, folder / METHOD, report]
+    found = answer(pages[0], f"""
+        const found = [];
+        for (const width of [380, 1200]) {{
+          frame.style.width = `${{width}}px`;
+          for (const page of {json.dumps([page.as_uri() for page in pages])}) {{
+            await open(page);
+            one("thead th:nth-child(2) button").click();
+            all("details").forEach((details) => {{ details.open = true; }});
+            found.push([width, frame.contentDocument.documentElement.scrollWidth, one("tbody td").textContent,
+              all("table, pre, figure > div > svg").every(
+                (it) => it.closest('.card[tabindex="0"][role=region][aria-label]')),
+              all(".card").some((card) => card.scrollWidth > card.clientWidth)]);
+          }}
         }}
-        return found;""", STILL)
-    assert tips[0].startswith("1 − ẽ_c") and tips == [tips[0], tips[0], None, tips[0], None]
-
-
-@pytest.mark.parametrize("scripts", [True, False], ids=["with scripts", "without"])
-def test_trainings_open(folder, scripts):
-    """Training seeds expand without scripts too; they are sorted and filtered as one row."""
-    script = f"""
-        const parts = () => shown("{AGENTS} tr.part").length, before = parts();
-        one("{AGENTS} summary").click();
-        const found = [all("{AGENTS} summary").length, before, parts()];"""
-    sort = f"""
-        one("{AGENTS} thead th:nth-child(2) button").click();
-        found.push(all("{AGENTS} tbody tr").map((row) => row.cells[1].textContent));
-        type("ppo_seed1");
-        found.push(one("output").textContent);"""
-    found = answer(folder / "index.html", f"{script}{sort if scripts else ''} return found;", scripts=scripts)
-    assert found[:3] == [1, 0, 2]
-    if scripts:
-        assert [re.findall("seed.(?=@)", name) for name in found[3] if "ppo" in name.lower()] == [
-            [], ["seed0"], ["seed1"]]
-        assert found[4].startswith("1 of")
+        return found;""")
+    assert len(found) == 8 and found[3][2] == found[7][2] == "True model smoother"
+    for width, full, _, contained, wide in found:
+        assert full == width and contained and (wide or width > 380)
 
 
 @pytest.mark.parametrize(("flags", "first"), [((), 0), ((STILL,), 1)], ids=["moving", "still"])
@@ -218,13 +224,3 @@ def test_the_picture_can_be_stopped(flags, first, tmp_path):
         return [before, words, image.currentSrc];""", *flags)
     assert before.endswith(HEADLINE[first]) and after.endswith(HEADLINE[1 - first])
     assert words == ["Pause", "Play"][first]
-
-
-@pytest.mark.parametrize("width", [390, 1280])
-def test_the_results_page_fits(tmp_path, width):
-    """The HTML report is sortable and without overflow, like the site."""
-    path = write_page(EpisodeStore(tmp_path), run_leaderboards(widest()))
-    assert answer(path, """
-        one("thead th:nth-child(2) button").click();
-        return [frame.contentDocument.documentElement.scrollWidth, one("tbody td").textContent];""",
-                  width=width) == [width, "True model smoother"]

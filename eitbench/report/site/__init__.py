@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import ast
 import json
-import math
 import re
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -18,7 +17,7 @@ from typing import Any, NamedTuple
 from markupsafe import Markup
 
 from eitbench._files import PACKAGE, replace_folder
-from eitbench._sanitize import escape_csv, escape_markdown
+from eitbench._sanitize import escape_csv
 from eitbench.bench.methods import baseline_folder, builtin_files, builtin_sha256, version_of
 from eitbench.bench.records import finished_at, group_runs, record_file_name, split_outdated
 from eitbench.bench.scores import scores
@@ -39,8 +38,9 @@ from eitbench.report.boards import (
     leaderboards,
     reference_environments,
 )
+from eitbench.report.charts import Axis
 from eitbench.report.site import measured, robustness
-from eitbench.report.templates import markdown, markdown_list, render_template
+from eitbench.report.templates import markdown, render_template
 
 CATEGORY_TEXTS = {
     "filter": "Each state is estimated from the measurements until then (filtering).",
@@ -52,8 +52,8 @@ CATEGORY_TEXTS = {
 """Class -> task."""
 HEADLINE_ENVIRONMENT, AGENT_ENVIRONMENT = "eitbench-Pipe2D-v0", "eitbench-Pipe2DInjectionBudget-v0"
 HEADLINE_METHODS = ("homogeneous", "gauss_newton", "extended_kalman_filter")
-MULTIPLES = ("two", "three", "four", "five", "six", "seven", "eight", "nine", "ten", "eleven",
-             "twelve")
+MULTIPLES = dict(enumerate(("two", "three", "four", "five", "six", "seven", "eight", "nine", "ten",
+                            "eleven", "twelve"), 2))
 ROBUSTNESS_PAGE, MEASURED_PAGE = "robustness.html", "measured.html"
 HEADLINE = "headline.webp", "headline.png"
 """Animation of the first page, and its still picture. Others are named like an environment, as in
@@ -141,32 +141,23 @@ def render(site: Site) -> dict[str, str]:
     """Return the content of ``leaderboard.csv``, with the names and SI units of
     `eitbench.bench.load`, and of ``leaderboard.md``, by file name; records of measurement files are
     in the second only."""
-    parts = ["# Leaderboards", "*Rendered from the records by `eitbench leaderboard --records "
-             "leaderboards/results`; [README.md](README.md) explains how to add one.*",
-             "The test episodes are public: every user can simulate them." if site.boards
-             else "No records yet."]
-    for name, boards in site.classes.items():
-        parts.append(f"## {name}")
-        for board in boards:
-            seeds = f", {board.seeds}" if board.seeds else ""
-            parts += [f"### {escape_markdown(board.title)}{seeds}",
-                      tables.markdown_table(board).markdown()]
-    parts += [*robustness.markdown_section(site.boards), *measured.markdown_section(site.measured)]
-    if site.boards:
-        parts += ["## Column descriptions", markdown_list(column_descriptions())]
-    if outdated := split_outdated(site.records)[1]:
-        parts += ["## Superseded records", "From an earlier version of the method.\n\n"
-                  + "\n".join(f"- {escape_markdown(record_file_name(record))}"
-                              for record in outdated)]
+    text = render_template(
+        "site/leaderboard.md.j2", families=robustness.shift_families(site.boards),
+        robustness_columns=robustness.ROBUSTNESS_COLUMNS, measured=site.measured,
+        measured_columns=measured.MEASURED_COLUMNS, columns=column_descriptions(),
+        classes={name: [(board, tables.markdown_table(board)) for board in boards]
+                 for name, boards in site.classes.items()},
+        superseded=list(map(record_file_name, split_outdated(site.records)[1])))
     table = leaderboard_table(site.boards).replace({"environment": {
         record["environment"]["name"]: qualified_name(record["environment"])
         for record in site.records}})
     for name, score in scores().items():
         table[name] /= score.factor
     table["peak_memory"] /= 1e-6
-    texts = {name: table[name].map(escape_csv) for name in ("environment", "method", "title")}
-    plain = table.assign(**texts).to_csv(index=False, float_format="%.6g", lineterminator="\n")
-    return {"leaderboard.csv": plain, "leaderboard.md": "\n\n".join(parts) + "\n"}
+    names = ["environment", "method", "title"]
+    table[names] = table[names].map(escape_csv)
+    return {"leaderboard.csv": table.to_csv(index=False, float_format="%.6g", lineterminator="\n"),
+            "leaderboard.md": text.decode()}
 
 
 def write_site(folder: Path, files: Mapping[str, bytes]) -> None:
@@ -184,34 +175,17 @@ def write_site(folder: Path, files: Mapping[str, bytes]) -> None:
 # -- index -----------------------------------------------------------------------------------------
 
 
-class KeyFigure(NamedTuple):
-    """One of the numbers below the headline."""
-
-    value: str
-    about: str
-    board: Leaderboard
-
-
-class Headline(NamedTuple):
-    """The comparison of an image with and without a flow model."""
-
-    text: str
-    measured: str
-    figure: KeyFigure
-
-
 def index_page(site: Site) -> bytes:
     """Return the HTML of ``index.html``."""
     apart = reference_environments()
     shown = {name: [(board, tables.page_table(board, "", compact=True),
-                     tables.ScoreAxes.of(board).headers()) for board in boards
+                     tables.score_axes(board)) for board in boards
                     if board.environment not in apart]
              for name, boards in site.classes.items()}
     references = {name: [board for board in boards if board.environment in apart]
                   for name, boards in site.classes.items()}
-    top = headline(site)
     return site.page(
-        "index", headline=top, figures=[*([top.figure] if top else []), *key_figures(site)],
+        "index", headline=headline(site), **key_figures(site),
         moving=site.picture(HEADLINE[0], ""), still=site.picture(HEADLINE[1], ""),
         n_environments=sum(not board.is_aggregate for board in site.boards),
         n_records=len(site.records),
@@ -224,55 +198,33 @@ def index_page(site: Site) -> bytes:
                                          for _, table, _ in boards))
 
 
-def headline(site: Site) -> Headline | None:
-    """Return how many times a flow model reduces the error; None without official records."""
+def headline(site: Site) -> dict[str, Any] | None:
+    """Return the errors ẽ_c of images with and without a flow model, their ratio in words and the
+    leaderboard; None without official records."""
     board = site.board("filter", HEADLINE_ENVIRONMENT)
     errors = {row.cells["method"]: row.cells["error"] for row in (board.rows if board else ())
               if row.cells["official"] and row.complete}
     if board is None or not set(HEADLINE_METHODS) <= errors.keys():
         return None
-    flat, stationary, filtered = (errors[name] for name in HEADLINE_METHODS)
-    times = stationary / filtered
-    if not 2 <= times < len(MULTIPLES) + 2:
-        return None
-    return Headline(
-        f"A flow model reduces the error {MULTIPLES[int(times) - 2]}fold",
-        f"Stationary reconstruction (Gauss–Newton) has a relative squared error of "
-        f"{stationary:#.2g}, an extended Kalman filter with a flow model {filtered:#.2g}: "
-        f"{times:.1f} times less, or {math.sqrt(times):.1f} times less in its square root. "
-        f"The error is ‖ĉ − c‖²/‖c‖², "
-        f"averaged over {board.seeds} of {board.title}. "
-        f"The best homogeneous image has {flat:#.2g}.",
-        KeyFigure(f"{flat / filtered:.1f} ×", "less error than the best homogeneous image: the "
-                  f"extended Kalman filter on {board.title}", board))
+    homogeneous, stationary, filtered = (errors[name] for name in HEADLINE_METHODS)
+    multiple = MULTIPLES.get(int(stationary / filtered))
+    return {"multiple": multiple, "homogeneous": homogeneous, "stationary": stationary,
+            "filtered": filtered, "board": board} if multiple else None
 
 
-def key_figures(site: Site) -> list[KeyFigure]:
-    """Return up to two: skill scores of the best filter and of the best trained agent."""
-    def best(board: Leaderboard | None, *, trained: bool | None = None) -> tables.AgentRow | None:
-        return next((line for line in (tables.group_by_agent(board) if board else ())
-                     if line.row.is_ranked and trained in (None, bool(line.parts))), None)
+def key_figures(site: Site) -> dict[str, Any]:
+    """Return the aggregate of filters with its best row, and the number of its environments, and
+    the leaderboard of agents with its best agent and its best rule; missing ones are None."""
+    def best(board: Leaderboard | None, *, trained: bool | None = None) -> MethodRow | None:
+        return next((row for row in (tables.group_by_agent(board) if board else ())
+                     if row.is_ranked and trained in (None, bool(row.trainings))), None)
 
-    def percent(line: tables.AgentRow) -> str:
-        return f"{100 * line.row.cells['gain']:.0f} %"
-
-    found = []
-    board = site.board("filter", ALL)
-    if board and (first := best(board)):
-        count = sum(each.category == "filter" and each.environment in aggregate_environments()
-                    for each in site.boards)
-        found.append(KeyFigure(percent(first), "less error than the naive baseline with the best "
-                               f"filter ({first.row.cells['title']}), over {count} environments",
-                               board))
-    board = site.board("injection", AGENT_ENVIRONMENT)
-    agent, rule = best(board, trained=True), best(board, trained=False)
-    if board and agent and rule:
-        found.append(KeyFigure(
-            percent(agent), "less error than random pairs with an agent trained to choose when "
-            f"and where to inject ({agent.row.cells['title']}, mean of {len(agent.parts)} "
-            f"training seeds, on {board.title}); {percent(rule)} with the best rule-based policy",
-            board))
-    return found
+    filters, policies = site.board("filter", ALL), site.board("injection", AGENT_ENVIRONMENT)
+    names = aggregate_environments()
+    return {"filters": filters, "best_filter": best(filters), "policies": policies,
+            "best_agent": best(policies, trained=True), "best_rule": best(policies, trained=False),
+            "n_filter_environments": sum(board.category == "filter" and board.environment in names
+                                         for board in site.boards)}
 
 
 # -- environments ----------------------------------------------------------------------------------
@@ -286,7 +238,7 @@ def environment_page(site: Site, board: Leaderboard) -> bytes:
     animation = f"{board.environment}.webp"
     return site.page(
         "environment", "../", board=board, id=id, description=description, details=details,
-        table=table, axes=tables.ScoreAxes.of(board).headers(),
+        table=table, axes=tables.score_axes(board),
         explanations=tables.explanations([table]),
         front=tables.cost_chart(board), curves=tables.curve_chart(board),
         moving=site.picture(animation, "../"),
@@ -326,9 +278,10 @@ def method_page(site: Site, name: str) -> bytes:
         versions=[_version(own, addresses) for own in versions.values()])
 
 
-def _placements(placements: list[tuple[Leaderboard, MethodRow]]) -> tuple[Table, dict[str, Markup]]:
+def _placements(placements: list[tuple[Leaderboard, MethodRow]]) -> tuple[Table, dict[str, Axis]]:
     """Return one row for each board, and the axes of skill scores that all rows share."""
-    gains = tables.ScoreAxes.of(Leaderboard("", ALL, "", [row for _, row in placements]))
+    every = Leaderboard("", ALL, "", [row for _, row in placements])
+    gains = tables.score_axes(every)["skill score"]
     rows = []
     for board, row in placements:
         rank = row.cells["rank"]
@@ -338,11 +291,11 @@ def _placements(placements: list[tuple[Leaderboard, MethodRow]]) -> tuple[Table,
                           note=f"{board.category} · {row.cells['version']}", badges=row.badges),
             "rank": Cell(MISSING) if rank is None else Cell(
                 str(rank), float(rank), note=f"of {sum(each.is_ranked for each in board.rows)}"),
-            "ẽ_c": tables.ScoreAxes.of(board).cell(row, "error"),
-            "skill score": gains.cell(row, "gain"),
+            "ẽ_c": tables.interval_cell(row, "error", tables.score_axes(board)["ẽ_c"]),
+            "skill score": tables.interval_cell(row, "gain", gains),
             "ms/step": number_cell(row.cells["seconds_per_step"])})
     table = Table.of(rows, label="Results", keep=list(rows[0]) if rows else ())
-    return table, {"skill score": gains.headers()["skill score"]}
+    return table, {"skill score": gains}
 
 
 def _version(records: list[dict[str, Any]], addresses: dict[tuple[str, str], str],

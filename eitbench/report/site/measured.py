@@ -20,7 +20,6 @@ from eitbench.bench.text import format_number, scores_by_seed
 from eitbench.bench.tracks import registered_kwargs
 from eitbench.measured.cases import MeasuredCase, read_case
 from eitbench.report.tables import BADGES
-from eitbench.report.templates import markdown_list
 
 MEASURED_COLUMNS = {each.heading: each.explanation for each in scores("measured").values()
             if each.name != "error"} | {
@@ -94,19 +93,6 @@ EMPTY = MeasuredBoards({}, {}, [])
 def withheld_rmse(record: dict[str, Any]) -> float:
     """Mean over the episodes, relative to the noise."""
     return fmean(scores_by_seed(record, "prediction_error").values())
-
-
-def markdown_section(measured: MeasuredBoards) -> list[str]:
-    """Render the section of the boards as Markdown, in parts; none without records."""
-    if not measured.records:
-        return []
-    parts = ["## measured", "Measurements of real instruments: RMS residual of withheld "
-             "measurements, relative to the standard deviation of the noise.",
-             measured.all_cases_table().markdown()]
-    for name, case in measured.cases.items():
-        parts += [f"### {name}", f"{case.title}. Data: {case.source}, {case.file}; licence: "
-                  f"{case.licence}.", measured.case_table(name).markdown()]
-    return [*parts, markdown_list(MEASURED_COLUMNS)]
 
 
 def _label(record: dict[str, Any]) -> str:

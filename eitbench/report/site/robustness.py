@@ -19,7 +19,7 @@ from eitbench.bench.text import format_number
 from eitbench.bench.tracks import environment_name, ids, nominal_id
 from eitbench.report.boards import Leaderboard, MethodRow, base_environment
 from eitbench.report.tables import author_badges, filter_flags, method_cell
-from eitbench.report.templates import markdown, markdown_list
+from eitbench.report.templates import markdown
 from eitbench.worlds.registry import entry
 
 WORSE_THAN_NAIVE = "worse than naive"
@@ -70,7 +70,7 @@ class ShiftFamily(NamedTuple):
             gains = {name: row.cells["gain"] for name, row in own.items()
                      if row.complete and row.cells["gain"] is not None}
             row = home or next(iter(own.values()))
-            cells: dict[str, Cell | str] = {"method": method_cell(row, "", more=author_badges(row)),
+            cells: dict[str, Cell | str] = {"method": method_cell(row, "", author_badges(row)),
                                             "nominal": _error_cell(home)}
             cells |= {name: _error_cell(own.get(name), home, floors[name]) for name in self.shifts}
             least = min(gains, key=gains.__getitem__) if gains.keys() == shifted.keys() else ""
@@ -125,15 +125,3 @@ def _error_cell(row: MethodRow | None, home: MethodRow | None = None,
     if home and home.complete and row.complete and home.cells["error"]:
         ratio = f"× {format_number(error / home.cells['error'])}"
     return Cell(format_number(error), error, note=ratio, badges=(*below, *lacks))
-
-
-def markdown_section(boards: Iterable[Leaderboard]) -> list[str]:
-    """Return the Markdown section in parts; nothing without a record of a shift."""
-    found = shift_families(boards)
-    if not found:
-        return []
-    parts = ["## robustness", "Scores in nominal and shifted environments, ordered by the lowest "
-             "skill score."]
-    for family in found:
-        parts += [f"### {family.table.label}", family.table.markdown()]
-    return [*parts, markdown_list(ROBUSTNESS_COLUMNS)]
