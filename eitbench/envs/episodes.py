@@ -127,8 +127,10 @@ class EpisodeCore(ABC):
         t, estimate, std, currents = self.picture(b)
         world = self.world
         truth = concentration_at(world, self.seeds[b], t, self.n_initial + 1)
-        return draw_frame(self.task, truth_mesh(world), truth, estimate, std, currents,
-                          t * world.time_step, world.region)
+        fields = [("truth", truth_mesh(world), truth), ("estimate", self.task.mesh, estimate)]
+        spread = ("no reported uncertainty", np.zeros(len(estimate))) if std is None \
+            else ("standard deviation of the estimate", std)
+        return draw_frame(self.task, fields, currents, t * world.time_step, spread, world.region)
 
 
 class FixedLengthEnv(gym.Env[Any, Any]):  # type: ignore[misc]

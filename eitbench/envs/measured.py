@@ -204,14 +204,14 @@ class MeasuredEnv(FixedLengthEnv):
         if self._step == 0:
             raise gym.error.ResetNeeded("call reset() before render()")
         with require_extra("render()"):
-            from eitbench.envs.rendering import draw_comparison
+            from eitbench.envs.rendering import draw_frame
         t = max(self._step - 2, 0)
         estimate = self._last
         if estimate is None:
             estimate = np.full(self.task.mesh.n_nodes, self.task.expected_concentration)
         currents = self.measurements.currents[self.measurements.injection_index[t]]
-        return draw_comparison(self.task, [("estimate", self.task.mesh, estimate)], currents,
-                               float(self.measurements.times[t]))
+        return draw_frame(self.task, [("estimate", self.task.mesh, estimate)], currents,
+                          float(self.measurements.times[t]))
 
     def quality_warnings(self) -> list[str]:
         """Return data-quality warnings; see `eitbench.measured.quality`."""
