@@ -77,6 +77,8 @@ class InjectionCore(EpisodeCore):
         self._table = rules.action_currents if rules.limit is None else None
         if self._filters_type:
             self.n_initial = len(self.world.currents)
+        else:
+            self.max_batch = np.inf
         self.length = self.world.n_steps - self.n_initial
         self.action_space = rules.action_space
 
@@ -183,6 +185,20 @@ class InjectionCore(EpisodeCore):
         """Return the voltages (B, L) in V of injection t = k + 1."""
         return self.rules.instrument.measure(self.faults, k + 1, self._resistance[k], currents,
                                              self._draws[k])
+
+    def check(self, action: Any, space: Any) -> np.ndarray:
+        if isinstance(space, spaces.Box):
+            return _check.array("action", action, space.shape)
+        if isinstance(space, spaces.Discrete):
+            return np.array(_check.integer("action", action, low=0, high=int(space.n) - 1))
+        chosen = np.asarray(action)
+        if chosen.shape != space.shape or not np.issubdtype(chosen.dtype, np.integer):
+            raise ValueError(f"actions must be integers of shape {space.shape}, "
+                             f"got {chosen.dtype} of shape {chosen.shape}")
+        if chosen.min() < 0 or chosen.max() >= space.nvec[0]:
+            raise ValueError(f"actions must lie in [0, {space.nvec[0] - 1}], "
+                             f"got {chosen.min()} … {chosen.max()}")
+        return chosen
 
     def act(self, actions: np.ndarray) -> np.ndarray:
         """Inject the currents of actions (B,) or (B, L), and return the rewards (B,)."""

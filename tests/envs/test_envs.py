@@ -56,7 +56,7 @@ def test_contract(id, estimator, observation):
     env = injection_envs.make(estimator, id, observation) if estimator else make(id)
     actions = some_actions(env) if estimator else noise_actions(env)
     steps = play(env, 1, actions)
-    assert len(steps) - 1 == env.unwrapped.episode_steps == env.spec.max_episode_steps
+    assert len(steps) - 1 == env.unwrapped.episode_steps
     arrays = [array for step in steps for array in arrays_of(step[0])]
     assert len({array.__array_interface__["data"][0] for array in arrays}) == len(arrays)
     for shown, reward, terminated, truncated, info in steps:
@@ -66,25 +66,13 @@ def test_contract(id, estimator, observation):
         assert all(np.isscalar(value) for value in info.values())
     with pytest.raises(gym.error.ResetNeeded):
         env.unwrapped.step(actions[0])
-    again = gym.make(EnvSpec.from_json(env.spec.to_json()), max_episode_steps=-1)
+    again = gym.make(EnvSpec.from_json(env.spec.to_json()))
     assert again.unwrapped.world == env.unwrapped.world and again.unwrapped.task.lag == env.unwrapped.task.lag
     for other in (pickle.loads(pickle.dumps(env)), again):
         for a, b in zip(steps, play(other, 1, actions), strict=True):
             pairs = zip(arrays_of(a[0]), arrays_of(b[0]), strict=True)
             assert all((x == y).all() for x, y in pairs)
             assert a[1:] == b[1:]
-
-
-def test_gymnasiums_wrapper_of_the_spec_changes_one_flag():
-    """Gymnasium's wrapper around an environment from a spec with a number of steps truncates the last step too."""
-    env = make(PIPE)
-    again = gym.make(env.spec)
-    assert [step[2:4] for step in play(again, 0, noise_actions(env))][-2:] == [(False, False), (True, True)]
-    assert gym.spec(PIPE).max_episode_steps is None
-    steps = env.spec.max_episode_steps
-    assert gym.make_vec(env.spec, num_envs=2)._length == steps
-    with pytest.raises(ValueError, match=f"must be None or the steps of an episode, {steps}, got 1"):
-        gym.make_vec(PIPE, num_envs=2, max_episode_steps=1, **short(PIPE))
 
 
 @pytest.mark.parametrize("id", ESTIMATION)
@@ -153,7 +141,7 @@ def test_frames_show_truth_estimate_and_spread(id):
 
     bright = after(44.0)
     flat = after(30.0)
-    base.estimate_std = np.full(base.n_nodes, 4.0)
+    base.core.estimate_std = np.full(base.n_nodes, 4.0)
     spread = env.render()
     assert len({picture.tobytes() for picture in (first, flat, spread, bright)}) == 4
 
