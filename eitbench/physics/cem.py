@@ -95,11 +95,10 @@ class CompleteElectrodeModel:
         if sigma.ndim == 1:
             return self._centred(self._system.port_inverse(self._assemble(sigma)))
         flat = sigma.reshape(-1, self.mesh.n_nodes)
-        result = np.empty((len(flat), self.n_electrodes, self.n_electrodes))
-        for first in range(0, len(flat), self._system.batch):
-            some = slice(first, first + self._system.batch)
-            result[some] = self._centred(self._system.port_inverse(self._assemble(flat[some].T)))
-        return result.reshape(*sigma.shape[:-1], self.n_electrodes, self.n_electrodes)
+        size = self._system.batch
+        result = np.concatenate([self._system.port_inverse(self._assemble(flat[k:k + size].T))
+                                 for k in range(0, len(flat), size)])
+        return self._centred(result).reshape(*sigma.shape[:-1], *self._centre.shape[:1] * 2)
 
     def voltages(self, conductivity: np.ndarray, currents: np.ndarray) -> np.ndarray:
         """Potentials (K, L) in V for currents (K, L) in A (A/m in 2D); rows of both sum to zero."""
@@ -129,9 +128,7 @@ class CompleteElectrodeModel:
         The field of any injection is a combination of the L fields w_m of unit currents at m that
         leave in equal shares at all electrodes, so that ∂𝓡_ml/∂σ_j = −∫ φ_j ∇w_m·∇w_l.
         """
-        values = self._assemble(self._checked_conductivity(conductivity))
-        columns = self._system.port_columns(values)
-        fields, grounded = np.split(columns, [-self._system.n_ports])
+        fields, grounded = self._fields(conductivity)
         return self._centred(grounded), self._sensitivity(fields @ self._centre.T)
 
     def contact_derivatives(self, conductivity: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -141,9 +138,7 @@ class CompleteElectrodeModel:
         Let w_m be the field and W_m the electrode potentials of a unit current at m that leaves in
         equal shares at all electrodes. Then ∂𝓡_mk/∂z_l = (1/z_l²) ∫_{e_l} (w_m − W_m)(w_k − W_k).
         """
-        values = self._assemble(self._checked_conductivity(conductivity))
-        columns = self._system.port_columns(values)
-        fields, grounded = np.split(columns, [-self._system.n_ports])
+        fields, grounded = self._fields(conductivity)
         L = self.n_electrodes
         potentials = np.vstack([grounded, np.zeros((1, L - 1))])     # the last one is grounded
         derivatives = np.empty((L, L, L))
@@ -173,6 +168,13 @@ class CompleteElectrodeModel:
         """Return the entries of K for the solver, (k,) or (k, b) for (n_nodes,) or (n_nodes, b)."""
         values = self._derivatives @ conductivity
         return values + (self._constant if values.ndim == 1 else self._constant[:, None])
+
+    def _fields(self, conductivity: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return potentials (N, L − 1) and (L − 1, L − 1) of the nodes and the electrodes for unit
+        currents that leave at the last electrode."""
+        values = self._assemble(self._checked_conductivity(conductivity))
+        columns = self._system.port_columns(values)
+        return columns[:-self._system.n_ports], columns[-self._system.n_ports:]
 
     def _centred(self, grounded: np.ndarray) -> np.ndarray:
         resistance = self._centre @ grounded @ self._centre.T
@@ -216,12 +218,10 @@ class _Wall(NamedTuple):
 def _walls(basis: skfem.CellBasis, electrodes: Sequence[np.ndarray], order: int) -> list[_Wall]:
     mesh = basis.mesh
     ends = np.cumsum([len(facets) for facets in electrodes])
-    walls = []
-    for numbers in np.split(facet_numbers(mesh, np.concatenate(electrodes)), ends[:-1]):
-        wall = skfem.FacetBasis(mesh, element(mesh.dim(), order), intorder=2 * order,
-                                facets=numbers)
-        walls.append(_Wall(sp.csr_array(product.assemble(wall)), integral.assemble(wall)))
-    return walls
+    numbers = np.split(facet_numbers(mesh, np.concatenate(electrodes)), ends[:-1])
+    walls = [skfem.FacetBasis(mesh, element(mesh.dim(), order), intorder=2 * order, facets=each)
+             for each in numbers]
+    return [_Wall(sp.csr_array(product.assemble(wall)), integral.assemble(wall)) for wall in walls]
 
 
 @skfem.TrilinearForm
