@@ -37,7 +37,7 @@ def test_every_id_has_a_short_version():
 @pytest.mark.filterwarnings("ignore:We recommend you to use a symmetric and normalized Box action space")
 def test_checkers_pass(id):
     """Spaces, seeding, returned types and rendering meet the requirements of gymnasium and stable-baselines3."""
-    check_env(make(id, render_mode="rgb_array").unwrapped, skip_render_check=id not in KINDS)
+    check_env(make(id, render_mode="rgb_array").unwrapped, skip_render_check=id != STIRRED)
     check_env_sb3(make(id).unwrapped)
 
 
@@ -86,9 +86,9 @@ def test_world_is_that_of_the_id_but_for_the_changes(id):
     assert make(id, lag=1).unwrapped.lag == make(id, lag=1).unwrapped.task.lag == 1
 
 
-@pytest.mark.parametrize("id", ["eitbench/Pipe2DTimeVaryingVelocity-v0", STIRRED])
-def test_same_observation_in_another_process(id, tmp_path):
+def test_same_observation_in_another_process(tmp_path):
     """An episode depends on the seed only: another process with an empty cache simulates the same bits."""
+    id = "eitbench/Pipe2DTimeVaryingVelocity-v0"
     code = ("import gymnasium as gym, eitbench\n"
             f"observation, _ = gym.make({id!r}, **{short(id)!r}).reset(seed=1)\n"
             "print(observation['voltages'].tobytes().hex())")
@@ -97,8 +97,7 @@ def test_same_observation_in_another_process(id, tmp_path):
     assert make(id).reset(seed=1)[0]["voltages"].tobytes().hex() == other.stdout.strip()
 
 
-@pytest.mark.parametrize(("id", "kwargs", "dev"), [
-    (PIPE, {}, 0), (STIRRED, {}, 0), (PIPE, {"split": "dev"}, 100_000), (NAME, {"split": "dev"}, 100_000)])
+@pytest.mark.parametrize(("id", "kwargs", "dev"), [(STIRRED, {}, 0), (NAME, {"split": "dev"}, 100_000)])
 def test_resets_without_a_seed_follow_the_first_seed(id, kwargs, dev):
     """After a seeded reset, others draw all training or dev episodes from np_random, in vector environments too."""
     one, other = (make(id, **kwargs) for _ in range(2))
@@ -122,16 +121,14 @@ def test_wrong_splits_are_named():
         make(PIPE).reset(options={"split": "dev"})
 
 
-@pytest.mark.parametrize("id", [PIPE, LAGGED, SOLID, STIRRED])
+@pytest.mark.parametrize("id", [LAGGED, SOLID])
 def test_frames_show_truth_estimate_and_spread(id):
     """The image depends on estimate, standard deviation and time, for each kind of vessel and with a lag."""
     env = make(id, render_mode="rgb_array")
     base = env.unwrapped
     env.reset(seed=1)
     first = env.render()
-    assert first.dtype == np.uint8
-    assert first.ndim == 3
-    assert first.shape[2] == 3
+    assert first.dtype == np.uint8 and first.shape[2:] == (3,)
 
     def after(level: float) -> np.ndarray:
         env.reset(seed=1)

@@ -1,6 +1,5 @@
 """Sparse systems condensed onto their last unknowns, against dense inverses."""
 
-import pickle
 import sys
 from concurrent.futures import ThreadPoolExecutor
 
@@ -98,16 +97,6 @@ def test_wide_fronts_are_taken_one_by_one(monkeypatch):
     assert_allclose(inverses(alone, values), together, rtol=1e-12, atol=0)
 
 
-def test_entries_are_complete():
-    """The requested entries form the pattern: at least one triangle, no duplicates, no other entries."""
-    pattern = random_pattern(120, 5, seed=3)
-    system = Condensation(pattern, 5)
-    entries = (np.ones(len(system.rows)), (system.rows, system.columns))
-    asked = sp.coo_array(entries, shape=pattern.shape).toarray()
-    assert asked.max() == 1.0
-    assert_array_equal(np.maximum(asked, asked.T), pattern.toarray())
-
-
 def test_a_state_keeps_its_bits_wherever_it_stands_in_a_batch():
     """Lanes are independent, and a batch of any length gives the same numbers."""
     pattern = random_pattern(200, 6, seed=4)
@@ -125,28 +114,18 @@ def test_systems_and_threads_do_not_disturb_each_other():
     systems = []
     values = []
     alone = []
-    for k, n in enumerate((60, 300, 150, 420)):
+    for k, n in enumerate((60, 200, 150)):
         pattern = random_pattern(n, 5, seed=k)
         system = Condensation(pattern, 5)
         K, = random_matrices(pattern, 1, seed=k)
         systems.append(system)
         values.append(K[system.rows, system.columns])
         alone.append(system.port_columns(values[-1]))
-    jobs = [k % 4 for k in range(400)]
+    jobs = [k % 3 for k in range(120)]
     with ThreadPoolExecutor(4) as pool:
         together = list(pool.map(lambda k: systems[k].port_columns(values[k]), jobs))
     for k, columns in zip(jobs, together, strict=True):
         assert_array_equal(columns, alone[k])
-
-
-def test_pickled():
-    """A system sent to another process gives the same numbers."""
-    pattern = random_pattern(90, 4, seed=6)
-    system = Condensation(pattern, 4)
-    K, = random_matrices(pattern, 1, seed=7)
-    values = K[system.rows, system.columns]
-    sent = pickle.loads(pickle.dumps(system))
-    assert_array_equal(sent.port_inverse(values), system.port_inverse(values))
 
 
 def test_numba_that_does_not_work_is_named(monkeypatch):

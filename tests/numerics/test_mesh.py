@@ -134,18 +134,6 @@ def test_points_outside_are_located_at_the_nearest_wall(dim):
         assert any(weights[i] == 0 and tuple(np.sort(np.delete(cell, i))) in walls for i in range(dim + 1))
 
 
-@in_both_dimensions
-def test_interpolation_weighs_the_located_nodes(dim):
-    """Inside and outside, the matrix holds the barycentric coordinates of `locate` at the nodes of its cells."""
-    mesh = MESHES[dim]
-    points = np.random.default_rng(5).uniform(-0.5, 1.5, size=(100, dim))
-    cells, barycentric = mesh.locate(points)
-    assert cells.shape == (100,) and barycentric.shape == (100, dim + 1) and np.issubdtype(cells.dtype, np.integer)
-    expected = np.zeros((100, mesh.n_nodes))
-    np.put_along_axis(expected, mesh.cells[cells], barycentric, axis=1)
-    assert_array_equal(mesh.interpolation_to(points).toarray(), expected)
-
-
 # -- structured meshes ------------------------------------------------------------------------------------------------
 
 def test_rectangle_mesh_is_numbered_by_cross_section():
@@ -158,17 +146,6 @@ def test_rectangle_mesh_is_numbered_by_cross_section():
     matrix = mass_matrix(mesh).tocoo()
     assert np.abs(matrix.row - matrix.col).max() == 5 + 1
     assert_allclose(mesh.volumes.sum(), 4.0)
-
-
-def test_rectangle_mesh_is_symmetric():
-    """Alternating diagonals: with an even number of cells the mesh is its own mirror image in x and in y."""
-    mesh = rectangle_mesh(np.linspace(-1, 1, 5), np.linspace(-1, 1, 7))
-
-    def centroids(sign):
-        return np.sort(mesh.points[mesh.cells].mean(axis=1) * sign @ [1.0, 10.0])
-
-    for sign in ([-1.0, 1.0], [1.0, -1.0]):
-        assert_allclose(centroids(sign), centroids([1.0, 1.0]), atol=1e-12)
 
 
 @settings(max_examples=50)

@@ -53,7 +53,7 @@ each_section = pytest.mark.parametrize("section", SECTIONS.values(), ids=SECTION
 
 # -- discs ------------------------------------------------------------------------------------------------------------
 
-@pytest.mark.parametrize("seed", range(20))
+@pytest.mark.parametrize("seed", range(6))
 def test_rings_are_joined_without_gap_or_overlap(seed):
     """Triangles fill the outer polygon, meet edge to edge, and have the outer ring's edges as their only boundary."""
     radii, rings = random_rings(np.random.default_rng(seed))
