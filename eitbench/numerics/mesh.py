@@ -191,16 +191,6 @@ def _tree(corner: np.ndarray) -> tuple[cKDTree, float]:
     return cKDTree(middle), float(np.linalg.norm(corner - middle[:, None], axis=2).max())
 
 
-def validate_facets(name: str, facets: np.ndarray, mesh: Mesh) -> np.ndarray:
-    """Return ``facets`` as node numbers (k ≥ 1, d); ``ValueError`` with their name otherwise."""
-    facets = np.asarray(facets)
-    if (facets.ndim != 2 or facets.shape[1] != mesh.dim or len(facets) == 0
-            or not np.issubdtype(facets.dtype, np.integer)):
-        raise ValueError(f"{name} must be integers of shape (n_facets ≥ 1, {mesh.dim}), "
-                         f"got {facets.dtype} of shape {facets.shape}")
-    return facets
-
-
 def facet_set(facets: np.ndarray) -> set[tuple[int, ...]]:
     """Return facets as tuples of node numbers."""
     return set(map(tuple, facets.tolist()))

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from eitbench.numerics.fem import mass_matrix
 from eitbench.numerics.round_meshes import uniform_disc
-from eitbench.physics.flow import PlaneChannelFlow, PlugFlow, PowerLawFlow, RoundPipeFlow
+from eitbench.physics.flow import PlaneChannelFlow, PowerLawFlow, RoundPipeFlow
 from eitbench.physics.profiles import SkewedChannelFlow, VelocityModel, parabolic_model
 from eitbench.worlds.catalogue import PIPE_2D_SKEWED
 
@@ -95,7 +95,7 @@ def test_skewed_profile_is_the_formula(k):
 @pytest.mark.parametrize(("flow", "point", "velocity"), [
     (PlaneChannelFlow(1.0, 2.0), [0, 1], [1.125, 0.0]), (SkewedChannelFlow(1.0, 2.0), [0, 1], [1.125, 0.0]),
     (parabolic_model(2.0, 1.0, 1.0, 0.0).field([1.0]), [0, 1], [1.125, 0.0]),
-    (PowerLawFlow(1.0, 2.0, 0.5), [0, 1], [1.5 * np.sqrt(0.5), 0.0]), (PlugFlow(0.5), [0, 1], [0.5, 0.0]),
+    (PowerLawFlow(1.0, 2.0, 0.5), [0, 1], [1.5 * np.sqrt(0.5), 0.0]), (PowerLawFlow(0.5, 2.0, 0.0), [0, 2], [0.5, 0.0]),
     (RoundPipeFlow(1.0, 2.0), [0, 1, 0], [0.0, 0.0, 1.5])], ids=lambda value: type(value).__name__)
 def test_integer_points_are_taken_as_numbers(flow, point, velocity):
     """No field inherits an integer type from its points: 1.5·(1 − ¼) is not rounded to 1."""
@@ -156,7 +156,7 @@ def test_skewed_basis_rests_on_the_walls_and_only_the_first_carries_fluid():
 
 @pytest.mark.parametrize(("field", "arguments", "name"), [
     (PlaneChannelFlow, (-1.0, 0.05), "mean_velocity"), (PlaneChannelFlow, (4.5, np.inf), "half_width"),
-    (PowerLawFlow, (4.5, 0.05, 0.0), "exponent"), (PlugFlow, (-1.0,), "mean_velocity"),
+    (PowerLawFlow, (4.5, 0.05, -0.1), "exponent"), (PowerLawFlow, (-1.0, 0.05), "mean_velocity"),
     (RoundPipeFlow, (4.5, 0.0), "radius"), (SkewedChannelFlow, (4.5, R, 5.1), "skewness")])
 def test_errors_name_the_argument(field, arguments, name):
     """A negative, infinite or missing number is rejected by name."""
