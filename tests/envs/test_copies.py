@@ -2,8 +2,6 @@
 
 import copy
 import pickle
-import subprocess
-import sys
 
 import gymnasium as gym
 import numpy as np
@@ -77,20 +75,6 @@ def test_vector_environments(name, given, how):
     assert_equal([other.step(action) for action in actions], [envs.step(action) for action in actions])
     for each in (envs, other):
         each.close()
-
-
-def test_in_another_process(tmp_path):
-    """A pickled environment continues in another process."""
-    env, actions = begun(NAME, {})
-    (tmp_path / "env").write_bytes(pickle.dumps((env, actions)))
-    code = (f"import pathlib, pickle, sys\nimport eitbench\nhere = pathlib.Path({str(tmp_path)!r})\n"
-            "env, actions = pickle.loads((here / 'env').read_bytes())\n"
-            "(here / 'steps').write_bytes(pickle.dumps([env.step(action) for action in actions[:3]]))\n")
-    subprocess.run([sys.executable, "-c", code], check=True)
-    there = pickle.loads((tmp_path / "steps").read_bytes())
-    for a, b in zip(there, [env.step(action) for action in actions[:3]], strict=True):
-        np.testing.assert_allclose(a[1], b[1], rtol=1e-9)
-        assert a[2:] == b[2:]
 
 
 def test_a_copy_is_small():
