@@ -250,9 +250,7 @@ class InjectionCore(EpisodeCore):
 
     def innovations(self) -> list[Innovation | None]:
         """Return each episode's innovation of the last accepted measurements, for scores, not for
-        agents; None without an injection, an accepted measurement or an estimator."""
-        if not self._filters_type:
-            return [None] * len(self.n_injections)
+        agents; None without an injection or an accepted measurement."""
         return self._filters.innovations()
 
     def positions(self) -> np.ndarray | None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from functools import lru_cache
 from textwrap import fill
+from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
@@ -89,7 +90,7 @@ def draw_frame(task: Task, fields: list[tuple[str, Mesh, np.ndarray]], currents:
                     layout="constrained")
     canvas = FigureCanvasAgg(figure)
     panels = list(figure.subplots(*((1, count) if tank else (count, 1)), squeeze=False).flat)
-    bar = {"location": "bottom", "aspect": 50, "shrink": 0.8}
+    bar: dict[str, Any] = {"location": "bottom", "aspect": 50, "shrink": 0.8}
     for axes, (title, mesh, values) in zip(panels, fields, strict=False):
         mappable = draw_field(axes, mesh, values, *colour_range(task))
         axes.set_title(fill(title, 34 if tank else 80), loc="left", fontsize=10 if tank else 11)
