@@ -71,7 +71,7 @@ def draw_frame(task: Task, fields: list[tuple[str, Mesh, np.ndarray]], currents:
                region: tuple[float, float] | None = None) -> np.ndarray:
     """(height, width, 3) uint8: fields in one colour scale, and electrodes, at one time in s.
 
-    Panels of pipes are below each other, in 3D of the slice x = 0; those of tanks are in a row.
+    Panels of pipes are below each other, in 3D with the slice x = 0; panels of tanks are in a row.
 
     Parameters
     ----------

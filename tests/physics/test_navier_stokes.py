@@ -136,7 +136,7 @@ def centre_lines(flow, y, x):
 
 
 def test_cavity_at_reynolds_1000():
-    """Centre lines are those of Botella & Peyret (1998, Computers & Fluids 27, 421, Tables 9 and 10, whose lid moves
+    """Centre lines agree with Botella & Peyret (1998, Computers & Fluids 27, 421, Tables 9 and 10, whose lid moves
     the other way); with 32 × 32 cells the difference is 0.06 %."""
     y = [0.1016, 0.1719, 0.2813, 0.5, 0.7344, 0.9531]
     x = [0.0703, 0.1563, 0.5, 0.9063]
