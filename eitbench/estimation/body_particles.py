@@ -248,7 +248,8 @@ class BodyParticleFilter:
         """Return the expectation (B, m) of functionals of the body to the power of ``moment``."""
         if self._density is None:
             self._density = self._densities()
-        return np.asarray((images.power(moment) @ self._density[moment - 1].T).T)
+        # rounding of products with the result depends on its memory layout
+        return np.ascontiguousarray((images.power(moment) @ self._density[moment - 1].T).T)
 
     def body(self) -> np.ndarray:
         """Return the estimated `BODY` of each episode, (B, 9)."""
