@@ -43,7 +43,7 @@ __all__ = [
 _LAZY_NAMES = {"Estimate": "worlds.task", "Task": "worlds.task", "make_task": "worlds.task",
                "World": "worlds.world", "Episode": "data.episodes", "simulate": "data.episodes",
                "dataset": "data.dataset", "Rules": "estimation.onboard.rules",
-               "describe_environment": "envs.env_docs", "page": "envs.env_docs",
+               "describe_environment": "envs.env_docs",
                "evaluate": "bench.evaluation"}
 """Public name -> the module that is imported on its first use."""
 _LAZY_MODULES = {"leaderboard": "bench", "plot": "report.plot", "rl": "rl"}

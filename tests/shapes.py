@@ -126,7 +126,7 @@ def disc_modes(conductivity: Callable[[np.ndarray], np.ndarray], radius: float, 
 
 
 def disc_resistance(radius: float, spans: np.ndarray, contact_impedance: np.ndarray, modes: np.ndarray,
-                    wall_conductivity: float, degree: int = 24, n_modes: int = 30_000) -> np.ndarray:
+                    wall_conductivity: float, degree: int = 24, n_modes: int = 15_000) -> np.ndarray:
     """Return 𝓡 of a disc under the complete electrode model, without a mesh.
 
     The current density of electrode l is a sum of Legendre polynomials over its arc; its Fourier coefficients are

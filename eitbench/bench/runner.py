@@ -324,8 +324,8 @@ def _iter_steps(env: EstimationEnv | MeasuredEnv, estimator: Method, seed: int,
                              f"at t = {t} it returned None")
         if estimate is not None:
             _check_estimate(estimate, env.task, np.isfinite(seen["voltages"]))
-            if estimate.variance is not None:
-                env.estimate_std = np.sqrt(estimate.variance)
+            if estimate.variance is not None and isinstance(env, EstimationEnv):
+                env.core.estimate_std = np.sqrt(estimate.variance)
         observation, _, done, _, _ = env.step(_action(env.task, estimate, silence))
         yield t, estimate, seen, seconds
 

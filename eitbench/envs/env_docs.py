@@ -67,10 +67,6 @@ def _returns_table(id: str) -> list[str]:
             "\n".join(["| group | best policy | return |", "|---|---|---:|", *lines])]
 
 
-page = describe_environment
-"""Name in earlier versions."""
-
-
 def _overview(env: Any) -> str:
     """Return a table of the sizes of an environment."""
     world = env.world

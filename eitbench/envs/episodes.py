@@ -6,14 +6,13 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
+from copy import copy
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
-from gymnasium.envs.registration import EnvSpec
 from gymnasium.utils import seeding
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
@@ -31,8 +30,6 @@ if TYPE_CHECKING:
 Observation = dict[str, np.ndarray]
 RESET_NEEDED = "call reset() before step(), and again when an episode has ended"
 RENDER_MODES = ["rgb_array"]
-MAX_CORE_EPISODES = 16
-"""Episodes of a core in a vector environment: the arrays of more do not fit a CPU core's cache."""
 
 
 class EpisodeCore(ABC):
@@ -49,6 +46,8 @@ class EpisodeCore(ABC):
     """of one episode"""
     action_space: spaces.Space
     """of one episode"""
+    max_batch: float = 16
+    """largest B in a vector environment: the arrays of more do not fit a CPU core's cache"""
 
     def __init__(self, world: World, **task_options: Any) -> None:
         self.world = world
@@ -99,6 +98,11 @@ class EpisodeCore(ABC):
         """Copy the arrays of cached episodes, which are mapped from files that stay open."""
 
     @abstractmethod
+    def check(self, action: Any, space: Any) -> np.ndarray:
+        """Return an action in `action_space`, or a batch in a ``space`` with a leading axis;
+        ``ValueError`` if it is not."""
+
+    @abstractmethod
     def act(self, actions: np.ndarray) -> np.ndarray:
         """Take valid actions (B, …) and return the rewards (B,)."""
 
@@ -127,30 +131,10 @@ class EpisodeCore(ABC):
         t, estimate, std, currents = self.picture(b)
         world = self.world
         truth = concentration_at(world, self.seeds[b], t, self.n_initial + 1)
-        return draw_frame(self.task, truth_mesh(world), truth, estimate, std, currents,
-                          t * world.time_step, world.region)
-
-
-class FixedLengthEnv(gym.Env[Any, Any]):  # type: ignore[misc]
-    """An environment whose ``spec`` states the steps of its episodes as ``max_episode_steps``.
-
-    The last step is ``terminated``, and ids are registered without that number, so
-    `gymnasium.make` adds no `gymnasium.wrappers.TimeLimit`. An environment made from this spec has
-    one, whose last step is ``truncated`` too (``gymnasium.make(spec, max_episode_steps=-1)`` leaves
-    it out).
-    """
-
-    episode_steps: int
-    _spec: EnvSpec | None = None
-
-    @property
-    def spec(self) -> EnvSpec | None:
-        """Specification that the environment was made from."""
-        return self._spec
-
-    @spec.setter
-    def spec(self, made_from: EnvSpec | None) -> None:
-        self._spec = made_from and replace(made_from, max_episode_steps=self.episode_steps)
+        fields = [("truth", truth_mesh(world), truth), ("estimate", self.task.mesh, estimate)]
+        spread = ("no reported uncertainty", np.zeros(len(estimate))) if std is None \
+            else ("standard deviation of the estimate", std)
+        return draw_frame(self.task, fields, currents, t * world.time_step, spread, world.region)
 
 
 def check_render_mode(render_mode: str | None) -> str | None:
@@ -160,14 +144,18 @@ def check_render_mode(render_mode: str | None) -> str | None:
     return render_mode
 
 
-def can_render(render_mode: str | None) -> bool:
-    """Return whether an image can be drawn; warn without a mode."""
-    if render_mode is None:
+def can_render(env: Any) -> bool:
+    """Return whether an image can be drawn: warn without a mode; ``ResetNeeded`` before the first
+    episode."""
+    if env.render_mode is None:
         gym.logger.warn("render() needs gym.make(..., render_mode='rgb_array')")
-    return render_mode is not None
+        return False
+    if env._step == 0:
+        raise gym.error.ResetNeeded("call reset() before render()")
+    return True
 
 
-class EpisodeEnv(FixedLengthEnv):
+class EpisodeEnv(gym.Env[Any, Any]):  # type: ignore[misc]
     """One episode of a core at a time."""
 
     metadata = {"render_modes": RENDER_MODES, "render_fps": 8}  # noqa: RUF012 (gymnasium's form)
@@ -211,7 +199,8 @@ class EpisodeEnv(FixedLengthEnv):
         """Take an action; ``ValueError`` if it is not in the action space."""
         if not 1 <= self._step <= self.episode_steps:
             raise gym.error.ResetNeeded(RESET_NEEDED)
-        reward = float(self.core.act(self._checked(action))[0])
+        checked = self.core.check(action, self.action_space)
+        reward = float(self.core.act(checked[None])[0])
         self._step += 1
         ended = self._step > self.episode_steps
         return self._observe(), reward, ended, False, self._info()
@@ -225,17 +214,10 @@ class EpisodeEnv(FixedLengthEnv):
         return {name: array[0] for name, array in shown.items()} if isinstance(shown, dict) \
             else shown[0]
 
-    def _checked(self, action: Any) -> np.ndarray:
-        """Return a valid action with a batch axis of length 1."""
-        raise NotImplementedError
-
     def render(self) -> np.ndarray | None:  # type: ignore[override]
         """(height, width, 3) uint8: truth, estimate, its standard deviation, electrodes; None
         without a mode."""
-        if not can_render(self.render_mode):
-            return None
-        self.require_reset("render()")
-        return self.core.draw(0)
+        return self.core.draw(0) if can_render(self) else None
 
     def require_reset(self, caller: str) -> None:
         """Raise ``ResetNeeded`` before the first episode."""
@@ -255,57 +237,29 @@ class EpisodeVectorEnv(gym.vector.VectorEnv[Any, np.ndarray, np.ndarray]):
     metadata = {"render_modes": RENDER_MODES, "render_fps": 8,  # noqa: RUF012
                 "autoreset_mode": AutoresetMode.NEXT_STEP}
 
-    def __init__(self, make_core: Callable[[], EpisodeCore], num_envs: int, episodes: int | None,
-                 split: str, render_mode: str | None, max_episode_steps: int | None, *,
-                 threads: int = 1, core_episodes: int = MAX_CORE_EPISODES) -> None:
+    def __init__(self, core: EpisodeCore, num_envs: int, episodes: int | None, split: str,
+                 render_mode: str | None, threads: int = 1) -> None:
         self.render_mode = check_render_mode(render_mode)
         self.num_envs = _check.integer("num_envs", num_envs, low=1)
         self.pool = EpisodeSampler(episodes, split)
         """episodes of unseeded resets"""
         self._threads = _check.integer("threads", threads, low=1)
-        size = min(core_episodes, -(-num_envs // threads))
+        size = int(min(core.max_batch, -(-num_envs // threads)))
         self._parts = [slice(first, first + size) for first in range(0, num_envs, size)]
-        self.cores: list[Any] = [make_core() for _ in self._parts]
-        first_core = self.cores[0]
-        self.world: World = first_core.world
-        self._length: int = first_core.length
-        if max_episode_steps not in (None, self._length):      # gymnasium passes the spec's value
-            raise ValueError("max_episode_steps must be None or the steps of an episode, "
-                             f"{self._length}, got {max_episode_steps!r}")
-        self.single_observation_space = first_core.observation_space
-        self.single_action_space = first_core.action_space
+        self.cores: list[Any] = [copy(core) for _ in self._parts]
+        self.world: World = core.world
+        self.single_observation_space = core.observation_space
+        self.single_action_space = core.action_space
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
         self._randoms: list[np.random.Generator | None] = [None] * num_envs
         self._step = 0
-        self._ended = False
-        self._start_threads()
-
-    def _start_threads(self) -> None:
-        self._executor = ThreadPoolExecutor(self._threads) if self._threads > 1 else None
-        self._map = self._executor.map if self._executor else map
-
-    def __getstate__(self) -> dict[str, Any]:
-        """Return everything but the threads: a copy has separate ones."""
-        return {name: value for name, value in vars(self).items()
-                if name not in ("_executor", "_map")}
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        vars(self).update(state)
-        self._start_threads()
 
     def render(self) -> tuple[np.ndarray, ...] | None:  # type: ignore[override]
         """Draw each episode as `EpisodeEnv.render` does; None without a mode."""
-        if not can_render(self.render_mode):
+        if not can_render(self):
             return None
-        if self._step == 0:
-            raise gym.error.ResetNeeded("call reset() before render()")
         return tuple(core.draw(b) for core in self.cores for b in range(len(core.seeds)))
-
-    def close_extras(self, **kwargs: Any) -> None:
-        """Stop the threads."""
-        if self._executor:
-            self._executor.shutdown()
 
     @property
     def seeds(self) -> tuple[int, ...]:
@@ -333,8 +287,7 @@ class EpisodeVectorEnv(gym.vector.VectorEnv[Any, np.ndarray, np.ndarray]):
         for core, part in zip(self.cores, self._parts, strict=True):
             core.reset(chosen[part])
         self._step = 1
-        self._ended = False
-        return self._observe(), self._info()
+        return _joined([core.format() for core in self.cores]), self._info()
 
     def _seeds(self, seed: int | list[int | None] | None) -> list[int | None]:
         if seed is None:
@@ -353,35 +306,34 @@ class EpisodeVectorEnv(gym.vector.VectorEnv[Any, np.ndarray, np.ndarray]):
         if self._step == 0:
             raise gym.error.ResetNeeded("call reset() before step()")
         none_ended = np.zeros(self.num_envs, dtype=bool)
-        if self._ended:
+        if self._step > self.cores[0].length:
             observation, info = self.reset()
             return observation, np.zeros(self.num_envs), none_ended, none_ended.copy(), info
-        checked = self._checked(actions)
-        by_core = [checked[part] for part in self._parts]
-        rewards = np.concatenate(list(self._map(type(self.cores[0]).act, self.cores, by_core)))
+        checked = self.cores[0].check(actions, self.action_space)
+
+        def advance(core: EpisodeCore, part: slice) -> tuple[np.ndarray, Any]:
+            return core.act(checked[part]), core.format()
+
+        if self._threads == 1:
+            done = list(map(advance, self.cores, self._parts))
+        else:
+            with ThreadPoolExecutor(self._threads) as executor:
+                done = list(executor.map(advance, self.cores, self._parts))
         self._step += 1
-        self._ended = self._step > self._length
-        ended = np.full(self.num_envs, self._ended)
-        return self._observe(), rewards, ended, none_ended, self._info()
-
-    def _checked(self, actions: np.ndarray) -> np.ndarray:
-        """Return valid actions (num_envs, …)."""
-        raise NotImplementedError
-
-    def _observe(self) -> Any:
-        shown = list(self._map(type(self.cores[0]).format, self.cores))
-        if not isinstance(shown[0], dict):
-            return np.concatenate(shown)
-        return {name: np.concatenate([part[name] for part in shown]) for name in shown[0]}
+        ended = np.full(self.num_envs, self._step > self.cores[0].length)
+        rewards, shown = zip(*done, strict=True)
+        return _joined(shown), np.concatenate(rewards), ended, none_ended, self._info()
 
     def _info(self) -> dict[str, Any]:
         info = {"step": np.full(self.num_envs, self._step)}
-        errors = self.errors()
+        errors = np.concatenate([core.errors() for core in self.cores])
         if not np.isnan(errors).all():
             info["error"] = errors
         return info | {f"_{name}": np.ones(self.num_envs, dtype=bool) for name in info}
 
-    def errors(self) -> np.ndarray:
-        """(num_envs,) relative errors (5.12), NaN if not scored; for scoring, never for agents."""
-        return np.concatenate([core.errors() for core in self.cores])
 
+def _joined(shown: Sequence[Any]) -> Any:
+    """Return the observations of several cores together."""
+    if not isinstance(shown[0], dict):
+        return np.concatenate(shown)
+    return {name: np.concatenate([part[name] for part in shown]) for name in shown[0]}

@@ -19,7 +19,7 @@ from eitbench.data.episode_cache import (
 )
 from eitbench.envs.episodes import EpisodeCore, EpisodeEnv, EpisodeVectorEnv, Observation
 from eitbench.worlds.random_streams import episode_streams
-from eitbench.worlds.registry import Entry, entry
+from eitbench.worlds.registry import entry
 from eitbench.worlds.task import lag_steps, make_task
 from eitbench.worlds.world import Discretisation, World
 
@@ -93,6 +93,9 @@ class EstimationCore(EpisodeCore):
             if world.velocity_model is not None:
                 self._flows.append((entries["velocity_moment"].copy(),
                                     entries["velocity_square"].copy()))
+
+    def check(self, action: Any, space: Any) -> np.ndarray:
+        return check_actions(action, space, self.n_nodes)
 
     def act(self, actions: np.ndarray) -> np.ndarray:
         world = self.world
@@ -179,22 +182,11 @@ class EstimationEnv(EpisodeEnv):
                  world: dict[str, Any] | None = None, lag: int | str | None = None,
                  assume: dict[str, Any] | None = None, episodes: int | None = None,
                  split: str = "train", render_mode: str | None = None) -> None:
-        resolved, self.lag, assumed = resolve_arguments(entry(name, variant), world, lag, assume)
-        super().__init__(EstimationCore(resolved, self.lag, assumed), episodes, split, render_mode)
-        self.n_nodes = self.core.n_nodes
+        core = make_core(name, variant, world, lag, assume)
+        super().__init__(core, episodes, split, render_mode)
+        self.lag = core.lag
+        self.n_nodes = core.n_nodes
         """nodes of the mesh of the estimates"""
-
-    @property
-    def estimate_std(self) -> np.ndarray | None:
-        """Standard deviation of the last estimate, see `EstimationCore`."""
-        return self.core.estimate_std
-
-    @estimate_std.setter
-    def estimate_std(self, std: np.ndarray | None) -> None:
-        self.core.estimate_std = std
-
-    def _checked(self, action: Any) -> np.ndarray:
-        return check_actions(action, self.action_space, self.n_nodes)[None]
 
     def truth(self) -> np.ndarray:
         """(T, n_truth) concentration in mol/m³, t = 1 … T; for scoring, never for agents."""
@@ -225,32 +217,23 @@ class EstimationEnv(EpisodeEnv):
 class EstimationVectorEnv(EpisodeVectorEnv):
     """`EstimationEnv`, many times; see there and `EpisodeVectorEnv`."""
 
-    def __init__(self, name: str, *, num_envs: int = 1, variant: str | None = None,
-                 world: dict[str, Any] | None = None, lag: int | str | None = None,
-                 assume: dict[str, Any] | None = None, episodes: int | None = None,
-                 split: str = "train", render_mode: str | None = None,
-                 max_episode_steps: int | None = None) -> None:
-        resolved, lag, assumed = resolve_arguments(entry(name, variant), world, lag, assume)
-        super().__init__(lambda: EstimationCore(resolved, lag, assumed), num_envs, episodes, split,
-                         render_mode, max_episode_steps)
-
-    def _checked(self, actions: np.ndarray) -> np.ndarray:
-        return check_actions(actions, self.action_space, self.cores[0].n_nodes)
+    def __init__(self, name: str, *, num_envs: int = 1, episodes: int | None = None,
+                 split: str = "train", render_mode: str | None = None, **arguments: Any) -> None:
+        super().__init__(make_core(name, **arguments), num_envs, episodes, split, render_mode)
 
 
-def resolve_arguments(registered: Entry, changes: dict[str, Any] | None, lag: int | str | None,
-                      assumed: dict[str, Any] | None) -> tuple[World, int, dict[str, Any]]:
-    """Return the world, the lag and the assumptions on the flow of an id with these arguments;
-    ``ValueError`` names an argument that is not allowed."""
-    world = registered.world.with_changes(changes)
-    if lag is None:
-        lag = registered.settings.get("lag", 0)
-    if assumed is None:
-        assumed = registered.settings.get("assume", {})
+def make_core(name: str, variant: str | None = None, world: dict[str, Any] | None = None,
+              lag: int | str | None = None, assume: dict[str, Any] | None = None) -> EstimationCore:
+    """Return the core of an id with these arguments; ``ValueError`` names an argument that is not
+    allowed."""
+    registered = entry(name, variant)
+    changed = registered.world.with_changes(world)
+    assumed = registered.settings.get("assume", {}) if assume is None else assume
     if not isinstance(assumed, Mapping):
         raise ValueError(f"assume must be a dict of assumptions on the flow, got {assumed!r}")
-    world.flow.check_assumed(world, dict(assumed))
-    return world, lag_steps(world, lag), dict(assumed)
+    changed.flow.check_assumed(changed, dict(assumed))
+    steps = lag_steps(changed, registered.settings.get("lag", 0) if lag is None else lag)
+    return EstimationCore(changed, steps, dict(assumed))
 
 
 def check_actions(actions: Any, space: Any, n_nodes: int) -> np.ndarray:

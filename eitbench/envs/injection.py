@@ -5,13 +5,11 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from gymnasium import spaces
 
-from eitbench import _check
-from eitbench.envs.episodes import MAX_CORE_EPISODES, EpisodeEnv, EpisodeVectorEnv
+from eitbench.envs.episodes import EpisodeEnv, EpisodeVectorEnv
 from eitbench.envs.injection_core import InjectionCore
 from eitbench.estimation.onboard.rules import Rules
-from eitbench.worlds.registry import Entry, entry
+from eitbench.worlds.registry import entry
 
 
 class InjectionEnv(EpisodeEnv):
@@ -72,16 +70,9 @@ class InjectionEnv(EpisodeEnv):
                  observation: str = "scaled", gate: float | None = None, inflow: str | None = None,
                  episodes: int | None = None, split: str = "train",
                  render_mode: str | None = None) -> None:
-        self.rules = resolve_rules(entry(name, variant), world, gate, inflow, estimator)
-        super().__init__(InjectionCore(self.rules, estimator, observation), episodes, split,
-                         render_mode)
-
-    def _checked(self, action: Any) -> np.ndarray:
-        space = self.action_space
-        if isinstance(space, spaces.Discrete):
-            number = _check.integer("action", action, low=0, high=int(space.n) - 1)
-            return np.array([number])
-        return _check.array("action", action, space.shape or ())[None]
+        core = make_core(name, variant, world, estimator, observation, gate, inflow)
+        super().__init__(core, episodes, split, render_mode)
+        self.rules = core.rules
 
     def action_masks(self) -> np.ndarray:
         """(actions,) bool: numbered actions that have an effect; only the last one, without an
@@ -98,7 +89,7 @@ class InjectionEnv(EpisodeEnv):
 
 
 class InjectionVectorEnv(EpisodeVectorEnv):
-    """`InjectionEnv`, many times; parameters as there and in `EpisodeVectorEnv`.
+    """`InjectionEnv`, many times; see there and `EpisodeVectorEnv`.
 
     Parameters
     ----------
@@ -107,40 +98,26 @@ class InjectionVectorEnv(EpisodeVectorEnv):
         it.
     """
 
-    def __init__(self, name: str, *, num_envs: int = 1, variant: str | None = None,
-                 world: dict[str, Any] | None = None, estimator: str = "reduced",
-                 observation: str = "scaled", gate: float | None = None, inflow: str | None = None,
-                 episodes: int | None = None, split: str = "train", render_mode: str | None = None,
-                 threads: int = 1, max_episode_steps: int | None = None) -> None:
-        self.rules = rules = resolve_rules(entry(name, variant), world, gate, inflow, estimator)
-        super().__init__(lambda: InjectionCore(rules, estimator, observation), num_envs, episodes,
-                         split, render_mode, max_episode_steps, threads=threads,
-                         core_episodes=num_envs if estimator == "none" else MAX_CORE_EPISODES)
+    def __init__(self, name: str, *, num_envs: int = 1, episodes: int | None = None,
+                 split: str = "train", render_mode: str | None = None, threads: int = 1,
+                 **arguments: Any) -> None:
+        core = make_core(name, **arguments)
+        super().__init__(core, num_envs, episodes, split, render_mode, threads)
+        self.rules = core.rules
 
     def action_masks(self) -> np.ndarray:
         """(num_envs, actions) as in `InjectionEnv`."""
         return np.concatenate([core.action_masks() for core in self.cores])
 
-    def _checked(self, actions: np.ndarray) -> np.ndarray:
-        chosen = np.asarray(actions)
-        space = self.single_action_space
-        if not isinstance(space, spaces.Discrete):
-            return _check.array("actions", chosen, (self.num_envs, *(space.shape or ())))
-        if chosen.shape != (self.num_envs,) or not np.issubdtype(chosen.dtype, np.integer):
-            raise ValueError(f"actions must be integers of shape ({self.num_envs},), "
-                             f"got {chosen.dtype} of shape {chosen.shape}")
-        if chosen.min() < 0 or chosen.max() >= space.n:
-            raise ValueError(f"actions must lie in [0, {space.n - 1}], "
-                             f"got {chosen.min()} … {chosen.max()}")
-        return chosen
 
-
-def resolve_rules(registered: Entry, changes: dict[str, Any] | None, gate: float | None,
-                  inflow: str | None, estimator: str) -> Rules:
-    """Return the rules of an id with these arguments; ``ValueError`` names an argument that is not
+def make_core(name: str, variant: str | None = None, world: dict[str, Any] | None = None,
+              estimator: str = "reduced", observation: str = "scaled", gate: float | None = None,
+              inflow: str | None = None) -> InjectionCore:
+    """Return the core of an id with these arguments; ``ValueError`` names an argument that is not
     allowed."""
-    if gate is None:
-        gate = registered.settings.get("gate", np.inf)
-    if inflow is None:
-        inflow = registered.settings.get("inflow", "white")
-    return Rules(registered.world.with_changes(changes), gate, estimator != "none", inflow)
+    registered = entry(name, variant)
+    settings = registered.settings
+    rules = Rules(registered.world.with_changes(world),
+                  settings.get("gate", np.inf) if gate is None else gate, estimator != "none",
+                  settings.get("inflow", "white") if inflow is None else inflow)
+    return InjectionCore(rules, estimator, observation)

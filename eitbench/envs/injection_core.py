@@ -77,6 +77,8 @@ class InjectionCore(EpisodeCore):
         self._table = rules.action_currents if rules.limit is None else None
         if self._filters_type:
             self.n_initial = len(self.world.currents)
+        else:
+            self.max_batch = np.inf
         self.length = self.world.n_steps - self.n_initial
         self.action_space = rules.action_space
 
@@ -184,6 +186,20 @@ class InjectionCore(EpisodeCore):
         return self.rules.instrument.measure(self.faults, k + 1, self._resistance[k], currents,
                                              self._draws[k])
 
+    def check(self, action: Any, space: Any) -> np.ndarray:
+        if isinstance(space, spaces.Box):
+            return _check.array("action", action, space.shape)
+        if isinstance(space, spaces.Discrete):
+            return np.array(_check.integer("action", action, low=0, high=int(space.n) - 1))
+        chosen = np.asarray(action)
+        if chosen.shape != space.shape or not np.issubdtype(chosen.dtype, np.integer):
+            raise ValueError(f"actions must be integers of shape {space.shape}, "
+                             f"got {chosen.dtype} of shape {chosen.shape}")
+        if chosen.min() < 0 or chosen.max() >= space.nvec[0]:
+            raise ValueError(f"actions must lie in [0, {space.nvec[0] - 1}], "
+                             f"got {chosen.min()} … {chosen.max()}")
+        return chosen
+
     def act(self, actions: np.ndarray) -> np.ndarray:
         """Inject the currents of actions (B,) or (B, L), and return the rewards (B,)."""
         currents = self.rules.currents(actions) if self._table is None else self._table[actions]
@@ -234,9 +250,7 @@ class InjectionCore(EpisodeCore):
 
     def innovations(self) -> list[Innovation | None]:
         """Return each episode's innovation of the last accepted measurements, for scores, not for
-        agents; None without an injection, an accepted measurement or an estimator."""
-        if not self._filters_type:
-            return [None] * len(self.n_injections)
+        agents; None without an injection or an accepted measurement."""
         return self._filters.innovations()
 
     def positions(self) -> np.ndarray | None:

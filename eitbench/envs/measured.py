@@ -16,7 +16,6 @@ from eitbench._extras import require_extra
 from eitbench.envs.episodes import (
     RENDER_MODES,
     RESET_NEEDED,
-    FixedLengthEnv,
     Observation,
     can_render,
     check_render_mode,
@@ -44,7 +43,7 @@ WITHHOLDING_SEEDS = 100_000
 """Size of a split of seeds: ``test:3``, ``dev:3`` and ``train:3`` share their withheld mask."""
 
 
-class MeasuredEnv(FixedLengthEnv):
+class MeasuredEnv(gym.Env[Observation, np.ndarray]):  # type: ignore[misc]
     """Estimate the concentration in a real vessel from measurements, without ground truth.
 
     ## Action Space
@@ -83,7 +82,7 @@ class MeasuredEnv(FixedLengthEnv):
     | `moves` | None | whether the target moves; None: with two complete frames or more, or a flow |
     | `correction` | "offset" | of the misfit on homogeneous fluid; see `calibrate` |
     | `homogeneous_frames` | 1 | number of first frames that replace a missing reference |
-    | `render_mode` | None | "rgb_array": last estimate, standard deviation, active electrodes |
+    | `render_mode` | None | "rgb_array": last estimate, active electrodes |
 
     and the arguments of `task_from_measurements`. A case, such as `eitbench/Measured-iirc-v0`,
     fixes all but `file` and `render_mode`.
@@ -132,8 +131,6 @@ class MeasuredEnv(FixedLengthEnv):
         if correction != "none":
             self.available &= np.isfinite(self.calibration.mean_voltages)
         self.episode_steps = T
-        self.estimate_std: np.ndarray | None = None
-        """(n,) standard deviation of the last estimate in mol/m³, if the caller has one"""
         self._last: np.ndarray | None = None
         self._seed = -1
         self._step = 0
@@ -178,7 +175,7 @@ class MeasuredEnv(FixedLengthEnv):
             seed = int(self.np_random.integers(WITHHOLDING_SEEDS))
         self._withhold(seed % WITHHOLDING_SEEDS)
         self._step = 1
-        self.estimate_std = self._last = None
+        self._last = None
         return self._observe(), {"step": 1}
 
     def step(self, action: np.ndarray) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
@@ -197,21 +194,18 @@ class MeasuredEnv(FixedLengthEnv):
                 {"step": self._step})
 
     def render(self) -> np.ndarray | None:  # type: ignore[override]
-        """(height, width, 3) uint8: last estimate, its standard deviation if known, electrodes;
-        None without a mode."""
-        if not can_render(self.render_mode):
+        """(height, width, 3) uint8: last estimate, electrodes; None without a mode."""
+        if not can_render(self):
             return None
-        if self._step == 0:
-            raise gym.error.ResetNeeded("call reset() before render()")
         with require_extra("render()"):
-            from eitbench.envs.rendering import draw_comparison
+            from eitbench.envs.rendering import draw_frame
         t = max(self._step - 2, 0)
         estimate = self._last
         if estimate is None:
             estimate = np.full(self.task.mesh.n_nodes, self.task.expected_concentration)
         currents = self.measurements.currents[self.measurements.injection_index[t]]
-        return draw_comparison(self.task, [("estimate", self.task.mesh, estimate)], currents,
-                               float(self.measurements.times[t]))
+        return draw_frame(self.task, [("estimate", self.task.mesh, estimate)], currents,
+                          float(self.measurements.times[t]))
 
     def quality_warnings(self) -> list[str]:
         """Return data-quality warnings; see `eitbench.measured.quality`."""

@@ -38,7 +38,7 @@ class Condensation:
     rows, columns : (k,) int
         Positions in K of the values that methods take, in this order.
     batch : int
-        Best number of matrices per call.
+        Largest number of matrices per call.
     """
 
     def __init__(self, pattern: sp.csc_array, n_ports: int,
@@ -71,30 +71,22 @@ class Condensation:
         self.batch = 8 if self._front_size <= _WIDEST**2 else 1
 
     def port_inverse(self, values: np.ndarray) -> np.ndarray:
-        """Return the ports' block of K⁻¹: (m, m) for values (k,), (b, m, m) for values (k, b).
-
-        b is padded to multiples of eight.
-        """
-        if values.ndim == 1:
-            return np.linalg.inv(self._schur(self._factorise(values)))
-        if self.batch == 1:
-            columns = np.ascontiguousarray(values.T)
-            return np.stack([self.port_inverse(column) for column in columns])
+        """Return the ports' block of K⁻¹: (m, m) for values (k,), (b, m, m) for values (k, b) of
+        b ≤ `batch` matrices."""
+        if values.ndim == 1 or self.batch == 1:
+            inverse = np.linalg.inv(self._schur(self._factorise(values.ravel())))
+            return inverse if values.ndim == 1 else inverse[None]
         b = values.shape[1]
-        result = np.empty((b, self.n_ports, self.n_ports))
+        if b < self.batch:
+            values = np.pad(values, ((0, 0), (0, self.batch - b)), mode="edge")
         start, first_row, rows, panel, _ = self._symbolic
         memory = scratch((self._front_size + self._stack_size) * self.batch)
         front, stack = np.split(memory, [self._front_size * self.batch])
-        for first in range(0, b, self.batch):
-            block = values[:, first:first + self.batch]
-            padding = np.repeat(block[:, -1:], self.batch - block.shape[1], axis=1)
-            eight = np.concatenate([block, padding], axis=1) if padding.size else block
-            compiled_kernels().condense_lanes(
-                start, first_row, rows, panel, self._children, self._first_entry, self._slot,
-                np.ascontiguousarray(eight).ravel(), front, stack)
-            schur = self._symmetric(front[:self.n_ports**2 * self.batch].reshape(-1, self.batch).T)
-            result[first:first + self.batch] = np.linalg.inv(schur[:block.shape[1]])
-        return result
+        compiled_kernels().condense_lanes(start, first_row, rows, panel, self._children,
+                                          self._first_entry, self._slot, values.ravel(), front,
+                                          stack)
+        schur = self._symmetric(front[:self.n_ports**2 * self.batch].reshape(-1, self.batch).T)
+        return np.linalg.inv(schur[:b])
 
     def port_columns(self, values: np.ndarray) -> np.ndarray:
         """Return the ports' columns (n, m) of K⁻¹ for values (k,)."""

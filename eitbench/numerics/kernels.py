@@ -94,20 +94,17 @@ def subtract_product(_typing, total, a, b):
     return total(total, a, b), code
 
 
-@intrinsic
-def times(_typing, a, b):
-    """a·b"""
-    def code(_context, builder, _signature, arguments):
-        return builder.fmul(*arguments)
-    return a(a, b), code
+def _binary(instruction):
+    @intrinsic
+    def apply(_typing, a, b):
+        """a·b or a + b"""
+        def code(_context, builder, _signature, arguments):
+            return getattr(builder, instruction)(*arguments)
+        return a(a, b), code
+    return apply
 
 
-@intrinsic
-def plus(_typing, a, b):
-    """a + b"""
-    def code(_context, builder, _signature, arguments):
-        return builder.fadd(*arguments)
-    return a(a, b), code
+times, plus = (_binary(instruction) for instruction in ("fmul", "fadd"))
 
 
 @intrinsic
@@ -372,28 +369,42 @@ def subtract_gradient_products(cells, unknowns, gradient, fields, table, G):
                     store(out, to + twin, other)
 
 
+def _substitution(width, load, splat):
+    @njit(inline="always")
+    def rest(matrix, i, block):
+        """Return row i of a block minus row i of a matrix times the block."""
+        pointer, index, value = matrix
+        total = load(block, i * width)
+        for e in range(pointer[i], pointer[i + 1]):
+            total = subtract_product(total, splat(value[e]), load(block, index[e] * width))
+        return total
+
+    @njit
+    def substitute(lower, upper, scale, place, work, result):
+        """Solve with L and U, whose diagonals are 1 and 1/``scale``; unknown i goes to place[i]."""
+        for i in range(len(scale)):
+            store(work, i * width, rest(lower, i, work))
+        for i in range(len(scale) - 1, -1, -1):
+            total = times(rest(upper, i, work), splat(scale[i]))
+            store(work, i * width, total)
+            store(result, place[i] * width, total)
+
+    return substitute
+
+
+_substitute = _substitution(WIDTH, load, splat)
+_substitute_wide = _substitution(WIDE, load_wide, splat_wide)
+
+
 @njit(cache=True)
-def solve_lu(row_perm, column_perm, lower_pointer, lower_index, lower, upper_pointer,
-             upper_index, upper, scale, right, work, solution):
+def solve_lu(row_perm, place, lower, upper, scale, right, work, solution):
     """Solve A x = b for eight right-hand sides (n, 8).
 
-    L and U are given by rows; their diagonals are 1 and 1/``scale``.
+    L and U are (pointers, indices, values) by rows.
     """
-    n = len(scale)
-    for i in range(n):
+    for i in range(len(scale)):
         store(work, row_perm[i] * WIDTH, load(right, i * WIDTH))
-    for i in range(n):
-        total = load(work, i * WIDTH)
-        for e in range(lower_pointer[i], lower_pointer[i + 1]):
-            total = subtract_product(total, splat(lower[e]), load(work, lower_index[e] * WIDTH))
-        store(work, i * WIDTH, total)
-    for i in range(n - 1, -1, -1):
-        total = load(work, i * WIDTH)
-        for e in range(upper_pointer[i], upper_pointer[i + 1]):
-            total = subtract_product(total, splat(upper[e]), load(work, upper_index[e] * WIDTH))
-        store(work, i * WIDTH, times(total, splat(scale[i])))
-    for i in range(n):
-        store(solution, i * WIDTH, load(work, column_perm[i] * WIDTH))
+    _substitute(lower, upper, scale, place, work, solution)
 
 
 @njit(cache=True)
@@ -414,7 +425,7 @@ def advance_wide(mass, explicit, implicit_inlet, lower, upper, scale, row_perm, 
         halved = k < 2
         _right_side(mass if halved else explicit, rate if halved else 1.0, implicit_inlet,
                     (0.5 if halved else 1.0) * has_source, row_perm, state, inflow, source, work)
-        _substitute(lower, upper, scale, unknown, work, state)
+        _substitute_wide(lower, upper, scale, unknown, work, state)
         for j in range(len(inlet)):
             store(state, inlet[j] * WIDE, load_wide(inflow, j * WIDE))
 
@@ -431,17 +442,6 @@ def _right_side(matrix, rate, implicit_inlet, weight, row_perm, state, inflow, s
         store(work, row_perm[r] * WIDE, total)
 
 
-@njit
-def _substitute(lower, upper, scale, unknown, work, state):
-    """Solve with L and U, and write each unknown to its node."""
-    for i in range(len(scale)):
-        store(work, i * WIDE, _rest(lower, i, work))
-    for i in range(len(scale) - 1, -1, -1):
-        total = times(_rest(upper, i, work), splat_wide(scale[i]))
-        store(work, i * WIDE, total)
-        store(state, unknown[i] * WIDE, total)
-
-
 @njit(inline="always")
 def _row_product(matrix, r, block):
     """Multiply row r by a block; product and sum are rounded separately, as in scipy."""
@@ -449,16 +449,6 @@ def _row_product(matrix, r, block):
     total = splat_wide(0.0)
     for e in range(pointer[r], pointer[r + 1]):
         total = plus(total, times(splat_wide(value[e]), load_wide(block, index[e] * WIDE)))
-    return total
-
-
-@njit(inline="always")
-def _rest(matrix, i, block):
-    """Return row i of a block minus row i of a matrix times the block, rounded as in `solve_lu`."""
-    pointer, index, value = matrix
-    total = load_wide(block, i * WIDE)
-    for e in range(pointer[i], pointer[i + 1]):
-        total = subtract_product(total, splat_wide(value[e]), load_wide(block, index[e] * WIDE))
     return total
 
 
@@ -521,16 +511,6 @@ def particle_likelihoods(signals, index, shares, weights, currents, electrodes, 
                 for c in used:
                     covariance[b, a, c] += (weights[b, p] * (deviations[p, a] - mean[b, a])
                                             * (deviations[p, c] - mean[b, c]))
-
-
-@njit(cache=True)
-def add_columns(pointers, rows, values, weights, totals):
-    """Add a sparse matrix by columns times ``weights`` (B, columns) to ``totals`` (B, rows)."""
-    for b in range(len(weights)):
-        for j in range(weights.shape[1]):
-            if weights[b, j] != 0.0:
-                for e in range(pointers[j], pointers[j + 1]):
-                    totals[b, rows[e]] += weights[b, j] * values[e]
 
 
 @njit(cache=True)

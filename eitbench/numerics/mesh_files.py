@@ -64,51 +64,16 @@ def read_mesh(path: str | PathLike[str], sha256: str | None = None, *,
     """
     path = Path(path)
     scale = _check.number("scale", scale, low=0.0, open_low=True, units="m")
-    _check_file(path, sha256)
-    content = _content(path)
-    dim = _dimension(path, content)
-    cells = np.concatenate([block.data for block in content.cells if block.type == _CELL[dim]])
-    # gmsh 2.2 writes a cell of two groups twice.
-    _, first = np.unique(np.sort(cells, axis=1), axis=0, return_index=True)
-    used, numbers = np.unique(cells[np.sort(first)], return_inverse=True)
-    if np.ptp(content.points[used, dim:], axis=0).max(initial=0.0) > 1e-12 * np.ptp(
-            content.points):
-        raise ValueError(f"{path}: triangles must lie in a plane z = constant")
-    _check_distinct(path, content.points, used)
-    try:
-        mesh = Mesh(scale * np.asarray(content.points[used, :dim], dtype=float),
-                    numbers.reshape(-1, dim + 1))
-    except ValueError as error:
-        raise ValueError(f"{path}: {error}") from None
-    new_number = np.full(len(content.points), -1)
-    new_number[used] = np.arange(len(used))
-    boundary = facet_set(mesh.boundary_facets)
-    groups = {}
-    for name, facets in _facet_groups(path, content, dim).items():
-        groups[name] = np.unique(np.sort(new_number[facets], axis=1), axis=0)
-        if outside := facet_set(groups[name]) - boundary:
-            raise ValueError(f"{path}: group {name!r} must lie on the boundary, got "
-                             f"{len(outside)} of {len(facets)} facets that do not")
-    return MeshData(mesh, groups)
-
-
-def _check_distinct(path: Path, points: np.ndarray, used: np.ndarray) -> None:
-    """Raise ``ValueError``, with their coordinates, for nodes of cells at the same place."""
-    places, counts = np.unique(points[used], axis=0, return_counts=True)
-    if len(same := places[counts > 1]):
-        named = ", ".join(f"({', '.join(f'{value:g}' for value in place)})" for place in same[:3])
-        raise ValueError(f"{path}: nodes must have different coordinates, got several at {named}; "
-                         "in gmsh, `Coherence Mesh;` merges them")
-
-
-def _check_file(path: Path, sha256: str | None) -> None:
     if not path.is_file():
         raise ValueError(f"{path}: file not found")
-    if sha256 is not None:
-        found = hashlib.sha256(path.read_bytes()).hexdigest()
-        if found != sha256.lower():
-            raise ValueError(f"{path}: must be the file with SHA-256 {sha256}, got one with "
-                             f"{found}")
+    found = hashlib.sha256(path.read_bytes()).hexdigest()
+    if sha256 is not None and found != sha256.lower():
+        raise ValueError(f"{path}: must be the file with SHA-256 {sha256}, got one with {found}")
+    content = _content(path)
+    try:
+        return _mesh_data(content, scale)
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from None
 
 
 def _content(path: Path) -> Any:
@@ -128,19 +93,40 @@ def _content(path: Path) -> Any:
                          f"and cannot be read ({reason})") from error
 
 
-def _dimension(path: Path, content: Any) -> int:
-    """Return 2 or 3 for a mesh of straight triangles or tetrahedra only."""
+def _mesh_data(content: Any, scale: float) -> MeshData:
+    """Return the nodes that cells use, the cells, and the groups of a `meshio.Mesh`."""
     dims = {block.type: block.dim for block in content.cells if len(block.data)}
     dim = max(dims.values(), default=0)
     others = {kind for kind in dims if dims[kind] >= dim - 1} - {_CELL.get(dim), _FACET.get(dim)}
     if dim < 2 or others or _CELL[dim] not in dims:
-        raise ValueError(f"{path}: must hold only straight triangles, or only straight tetrahedra "
-                         "with triangles on their boundary, got "
+        raise ValueError("must hold only straight triangles, or only straight tetrahedra with "
+                         "triangles on their boundary, got "
                          f"{', '.join(sorted(dims)) or 'no cells'}")
-    return dim
+    cells = np.concatenate([block.data for block in content.cells if block.type == _CELL[dim]])
+    # gmsh 2.2 writes a cell of two groups twice.
+    _, first = np.unique(np.sort(cells, axis=1), axis=0, return_index=True)
+    used, numbers = np.unique(cells[np.sort(first)], return_inverse=True)
+    points = np.asarray(content.points[used], dtype=float)
+    if np.ptp(points[:, dim:], axis=0).max(initial=0.0) > 1e-12 * np.ptp(content.points):
+        raise ValueError("triangles must lie in a plane z = constant")
+    places, counts = np.unique(points, axis=0, return_counts=True)
+    if len(same := places[counts > 1]):
+        raise ValueError("nodes must have different coordinates, got several at "
+                         f"{same[0].tolist()}; in gmsh, `Coherence Mesh;` merges them")
+    mesh = Mesh(scale * points[:, :dim], numbers.reshape(-1, dim + 1))
+    new_number = np.full(len(content.points), -1)
+    new_number[used] = np.arange(len(used))
+    boundary = facet_set(mesh.boundary_facets)
+    groups = {}
+    for name, facets in _facet_groups(content, dim).items():
+        groups[name] = np.unique(np.sort(new_number[facets], axis=1), axis=0)
+        if outside := facet_set(groups[name]) - boundary:
+            raise ValueError(f"group {name!r} must lie on the boundary, got {len(outside)} of "
+                             f"{len(facets)} facets that do not")
+    return MeshData(mesh, groups)
 
 
-def _facet_groups(path: Path, content: Any, dim: int) -> dict[str, np.ndarray]:
+def _facet_groups(content: Any, dim: int) -> dict[str, np.ndarray]:
     """Return the facets (k, d) of each named group, in node numbers of the file."""
     names = {int(tag): name for name, (tag, of_dim) in content.field_data.items()
              if of_dim == dim - 1}
@@ -153,13 +139,13 @@ def _facet_groups(path: Path, content: Any, dim: int) -> dict[str, np.ndarray]:
         own = np.zeros(len(block.data), int) if tags is None else np.abs(tags[number])
         for tag in np.unique(own[own != 0]).tolist():
             if tag not in names:
-                raise ValueError(f"{path}: groups of boundary facets must have a name, which no "
-                                 f"group of another dimension has, got group {tag} without one")
+                raise ValueError("groups of boundary facets must have a name, which no group of "
+                                 f"another dimension has, got group {tag} without one")
             parts.setdefault(names[tag], []).append(block.data[own == tag])
         for name, sets in content.cell_sets.items():          # all groups of a facet, in gmsh 4.1
             if not name.startswith("gmsh:") and sets[number] is not None and len(sets[number]):
                 parts.setdefault(name, []).append(block.data[np.asarray(sets[number], dtype=int)])
     if empty := sorted(set(names.values()) - set(parts)):
-        raise ValueError(f"{path}: group {empty[0]!r} must hold facets, got none; in gmsh, mesh "
-                         "them and save without Mesh.SaveAll")
+        raise ValueError(f"group {empty[0]!r} must hold facets, got none; in gmsh, mesh them and "
+                         "save without Mesh.SaveAll")
     return {name: np.concatenate(facets) for name, facets in parts.items()}

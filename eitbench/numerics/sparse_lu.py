@@ -23,8 +23,8 @@ class LUFactors(NamedTuple):
 
     row_perm: np.ndarray
     """(n,) position of each row in the elimination order"""
-    column_perm: np.ndarray
-    """(n,) position of each column in the elimination order"""
+    columns: np.ndarray
+    """(n,) column at each position of the elimination order"""
     lower: CsrArrays
     """(n, n) L without its diagonal, which is 1"""
     upper: CsrArrays
@@ -57,7 +57,7 @@ class SparseLU:
                    if drop else factorise_no_pivot(matrix, "MMD_AT_PLUS_A"))
         L = sp.csr_array(sp.tril(factors.L, -1))
         U = sp.csr_array(sp.triu(factors.U, 1))
-        self.factors = LUFactors(factors.perm_r.astype(np.int64), factors.perm_c.astype(np.int64),
+        self.factors = LUFactors(factors.perm_r.astype(np.int64), np.argsort(factors.perm_c),
                                  (L.indptr, L.indices, L.data), (U.indptr, U.indices, U.data),
                                  1.0 / factors.U.diagonal())
 
@@ -65,12 +65,11 @@ class SparseLU:
         """Return A⁻¹ b for b (n, k)."""
         n, k = right.shape
         result = np.empty((n, k))
-        rows, columns, lower, upper, scale = self.factors
         eight, work, solution = scratch(3 * 8 * n).reshape(3, -1)
         for first in range(0, k, 8):
             block = right[:, first:first + 8]
             eight.reshape(n, 8)[:, :block.shape[1]] = block
-            compiled_kernels().solve_lu(rows, columns, *lower, *upper, scale, eight, work, solution)
+            compiled_kernels().solve_lu(*self.factors, eight, work, solution)
             result[:, first:first + 8] = solution.reshape(n, 8)[:, :block.shape[1]]
         return result
 

@@ -20,7 +20,7 @@ from eitbench import _check
 from eitbench.numerics.condensation import Condensation
 from eitbench.numerics.fem import basis as basis_on
 from eitbench.numerics.fem import element, facet_numbers, integral, product
-from eitbench.numerics.mesh import Mesh, facet_set, validate_facets
+from eitbench.numerics.mesh import Mesh, facet_set
 from eitbench.physics.sensitivity import Sensitivity
 
 
@@ -95,11 +95,10 @@ class CompleteElectrodeModel:
         if sigma.ndim == 1:
             return self._centred(self._system.port_inverse(self._assemble(sigma)))
         flat = sigma.reshape(-1, self.mesh.n_nodes)
-        result = np.empty((len(flat), self.n_electrodes, self.n_electrodes))
-        for first in range(0, len(flat), self._system.batch):
-            some = slice(first, first + self._system.batch)
-            result[some] = self._centred(self._system.port_inverse(self._assemble(flat[some].T)))
-        return result.reshape(*sigma.shape[:-1], self.n_electrodes, self.n_electrodes)
+        size = self._system.batch
+        result = np.concatenate([self._system.port_inverse(self._assemble(flat[k:k + size].T))
+                                 for k in range(0, len(flat), size)])
+        return self._centred(result).reshape(*sigma.shape[:-1], *self._centre.shape[:1] * 2)
 
     def voltages(self, conductivity: np.ndarray, currents: np.ndarray) -> np.ndarray:
         """Potentials (K, L) in V for currents (K, L) in A (A/m in 2D); rows of both sum to zero."""
@@ -129,9 +128,7 @@ class CompleteElectrodeModel:
         The field of any injection is a combination of the L fields w_m of unit currents at m that
         leave in equal shares at all electrodes, so that ∂𝓡_ml/∂σ_j = −∫ φ_j ∇w_m·∇w_l.
         """
-        values = self._assemble(self._checked_conductivity(conductivity))
-        columns = self._system.port_columns(values)
-        fields, grounded = np.split(columns, [-self._system.n_ports])
+        fields, grounded = self._fields(conductivity)
         return self._centred(grounded), self._sensitivity(fields @ self._centre.T)
 
     def contact_derivatives(self, conductivity: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -141,9 +138,7 @@ class CompleteElectrodeModel:
         Let w_m be the field and W_m the electrode potentials of a unit current at m that leaves in
         equal shares at all electrodes. Then ∂𝓡_mk/∂z_l = (1/z_l²) ∫_{e_l} (w_m − W_m)(w_k − W_k).
         """
-        values = self._assemble(self._checked_conductivity(conductivity))
-        columns = self._system.port_columns(values)
-        fields, grounded = np.split(columns, [-self._system.n_ports])
+        fields, grounded = self._fields(conductivity)
         L = self.n_electrodes
         potentials = np.vstack([grounded, np.zeros((1, L - 1))])     # the last one is grounded
         derivatives = np.empty((L, L, L))
@@ -173,6 +168,13 @@ class CompleteElectrodeModel:
         """Return the entries of K for the solver, (k,) or (k, b) for (n_nodes,) or (n_nodes, b)."""
         values = self._derivatives @ conductivity
         return values + (self._constant if values.ndim == 1 else self._constant[:, None])
+
+    def _fields(self, conductivity: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return potentials (N, L − 1) and (L − 1, L − 1) of the nodes and the electrodes for unit
+        currents that leave at the last electrode."""
+        values = self._assemble(self._checked_conductivity(conductivity))
+        columns = self._system.port_columns(values)
+        return columns[:-self._system.n_ports], columns[-self._system.n_ports:]
 
     def _centred(self, grounded: np.ndarray) -> np.ndarray:
         resistance = self._centre @ grounded @ self._centre.T
@@ -216,12 +218,10 @@ class _Wall(NamedTuple):
 def _walls(basis: skfem.CellBasis, electrodes: Sequence[np.ndarray], order: int) -> list[_Wall]:
     mesh = basis.mesh
     ends = np.cumsum([len(facets) for facets in electrodes])
-    walls = []
-    for numbers in np.split(facet_numbers(mesh, np.concatenate(electrodes)), ends[:-1]):
-        wall = skfem.FacetBasis(mesh, element(mesh.dim(), order), intorder=2 * order,
-                                facets=numbers)
-        walls.append(_Wall(sp.csr_array(product.assemble(wall)), integral.assemble(wall)))
-    return walls
+    numbers = np.split(facet_numbers(mesh, np.concatenate(electrodes)), ends[:-1])
+    walls = [skfem.FacetBasis(mesh, element(mesh.dim(), order), intorder=2 * order, facets=each)
+             for each in numbers]
+    return [_Wall(sp.csr_array(product.assemble(wall)), integral.assemble(wall)) for wall in walls]
 
 
 @skfem.TrilinearForm
@@ -252,12 +252,14 @@ def _checked_electrodes(mesh: Mesh, electrodes: Sequence[np.ndarray]) -> list[np
     checked = []
     for number, facets in enumerate(electrodes):
         name = f"electrodes[{number}]"
-        facets = np.sort(validate_facets(name, facets, mesh), axis=1)
+        facets = np.asarray(facets)
+        if facets.shape != (max(len(facets), 1), mesh.dim) or facets.dtype.kind not in "iu":
+            raise ValueError(f"{name} must be integers of shape (n_facets ≥ 1, {mesh.dim}), "
+                             f"got {facets.dtype} of shape {facets.shape}")
+        facets = np.sort(facets, axis=1)
         for facet in map(tuple, facets.tolist()):
             if facet not in boundary:
                 raise ValueError(f"{name} has facet {facet}, which is not on the mesh's boundary")
-            if owner.get(facet) == number:
-                raise ValueError(f"{name} holds facet {facet} twice")
             if facet in owner:
                 raise ValueError(f"{name} and electrodes[{owner[facet]}] overlap in facet {facet}")
             owner[facet] = number

@@ -23,20 +23,6 @@ class AxialFlow:
 
 
 @dataclass(frozen=True)
-class PlugFlow(AxialFlow):
-    """A uniform velocity v̄ along x: the limit of strong mixing or of no friction."""
-
-    mean_velocity: float
-    """v̄ in m/s, ≥ 0"""
-
-    def __post_init__(self) -> None:
-        check_flow(self.mean_velocity)
-
-    def profile(self, y: np.ndarray) -> np.ndarray:
-        return np.full(y.shape, self.mean_velocity)
-
-
-@dataclass(frozen=True)
 class ChannelFlow(AxialFlow):
     """A flow between parallel walls y = ±R."""
 
@@ -62,15 +48,16 @@ class PowerLawFlow(ChannelFlow):
     """Turbulent mean flow between parallel walls: v(y) = (1 + n)·v̄·(1 − |y|/R)ⁿ along x.
 
     With n = 1/7 this is the power law of Prandtl and von Kármán for moderate Reynolds numbers
-    (Schlichting, *Boundary-Layer Theory*, ch. XX).
+    (Schlichting, *Boundary-Layer Theory*, ch. XX); with n = 0 the velocity is uniform, the limit of
+    strong mixing or of no friction.
     """
 
     exponent: float = 1.0 / 7.0
-    """n, > 0"""
+    """n, ≥ 0"""
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        _check.number("exponent", self.exponent, low=0.0, open_low=True)
+        _check.number("exponent", self.exponent, low=0.0)
 
     def profile(self, y: np.ndarray) -> np.ndarray:
         # a wall node may lie outside by rounding, where the power has no value

@@ -231,12 +231,11 @@ class ConvectionDiffusion:
     @cached_property
     def _kernel_arguments(self) -> tuple[Any, ...]:
         """Matrices by rows, factors, nodes and rate: arguments of `eitbench.numerics.kernels`."""
-        row_perm, column_perm, lower, upper, scale = self._solver.factors
+        row_perm, columns, lower, upper, scale = self._solver.factors
         matrices = [(each.indptr, each.indices, each.data)
                     for each in (self._mass, self._explicit, self._implicit_inlet)]
-        unknown = self._free[np.argsort(column_perm)]
-        return (*matrices, lower, upper, scale, row_perm, unknown, self.inlet, self.substeps,
-                self.substeps / self.time_step)
+        return (*matrices, lower, upper, scale, row_perm, self._free[columns], self.inlet,
+                self.substeps, self.substeps / self.time_step)
 
     def _advance_wide(self, c: np.ndarray, before: np.ndarray, after: np.ndarray,
                       load: np.ndarray | None = None) -> np.ndarray:

@@ -86,7 +86,7 @@ def _compared_frames(env: Any, loaded: list[Method], seed: int, at: range) -> It
         fields = [("Truth", truth_mesh(env.world), truth)]
         fields += [(title, env.task.mesh, states[t][1]) for title, states in shown]
         time = t * env.task.transport.time_step
-        yield rendering.draw_comparison(env.task, fields, currents, time)
+        yield rendering.draw_frame(env.task, fields, currents, time)
 
 
 def _palette() -> Image.Image:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from eitbench import _check
-from eitbench.physics.flow import PlaneChannelFlow, PlugFlow, PowerLawFlow
+from eitbench.physics.flow import PlaneChannelFlow, PowerLawFlow
 from eitbench.physics.profiles import SkewedChannelFlow, VelocityModel, parabolic_model
 from eitbench.worlds.fields import check_positive, check_range
 from eitbench.worlds.vessels import Bulge, PlanePipe
@@ -56,7 +56,7 @@ class PipeFlow(Flow):
         profile = assumed.get("profile") or "parabolic"
         _check.choice("assume.profile", profile, PROFILES)
         if profile == "plug":
-            return PlugFlow(mean)
+            return PowerLawFlow(mean, world.vessel.half_width, exponent=0.0)
         if profile == "power-law":
             return PowerLawFlow(mean, world.vessel.half_width)
         laminar: VelocityField = world.vessel.laminar_velocity(mean)

@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from threadpoolctl import threadpool_limits
 
 from eitbench.envs.estimation import EstimationEnv
-from eitbench.physics.flow import PlaneChannelFlow, PlugFlow, PowerLawFlow
+from eitbench.physics.flow import PlaneChannelFlow, PowerLawFlow
 from eitbench.physics.transport import VelocityField
 from eitbench.worlds.flows import PROFILES
 
@@ -49,7 +49,8 @@ def profiles(seeds: list[int], jobs: int, out: Path) -> tuple[Path, str]:
     R = _half_width()
     y = np.linspace(-R, R, 401)
     points = np.stack([np.zeros_like(y), y], axis=1)
-    flows: tuple[VelocityField, ...] = (PlaneChannelFlow(MEAN_VELOCITY, R), PlugFlow(MEAN_VELOCITY),
+    flows: tuple[VelocityField, ...] = (PlaneChannelFlow(MEAN_VELOCITY, R),
+                                        PowerLawFlow(MEAN_VELOCITY, R, exponent=0.0),
                                         PowerLawFlow(MEAN_VELOCITY, R))
     for name, flow, style in zip(PROFILES, flows, ("-", "--", "-."), strict=True):
         left.plot(100 * y, flow(points)[:, 0], style, color=INK if name == "parabolic" else GREY,

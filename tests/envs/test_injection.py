@@ -8,8 +8,11 @@ from eitbench.data.episode_cache import cached_episode, cycle_voltages
 from eitbench.estimation.onboard.linearisation import electrode_pairs
 from eitbench.estimation.onboard.reduced_filters import ReducedFilters
 
-from injection_envs import CURRENTS, FAULTS, FLOW, INFLOW, INJECTION, NAME, arrays_of, filter_of, make, some_pairs
+from injection_envs import CURRENTS, FAULTS, FLOW, INFLOW, NAME, TANK, arrays_of, filter_of, make, some_pairs
 from short import world
+
+VECTORISED = (FAULTS, FLOW, INFLOW, TANK, "eitbench/SearchAndTrack-v0")
+"""One id of each kind of filter."""
 
 
 def make_many(name: str = NAME, num_envs: int = 2, mode: str = "vector_entry_point", **kwargs):
@@ -63,8 +66,7 @@ def integrated(mesh, values: np.ndarray, region: tuple[float, float]) -> float:
     return float((mesh.volumes[inside] * (middles**2).mean(axis=1)).sum())
 
 
-@pytest.mark.parametrize("name", [NAME, INFLOW, FLOW])
-@pytest.mark.parametrize("estimator", ["reduced", "full"])
+@pytest.mark.parametrize(("estimator", "name"), [("reduced", INFLOW), ("reduced", FLOW), ("full", NAME)])
 def test_reward_is_the_decrease_of_the_error(estimator, name):
     """The reward equals ∫(ĉ_bh − c)²/∫c² − ∫(ĉ − c)²/∫c² over the region's cells of the truth's mesh."""
     env = make(estimator, name)
@@ -92,8 +94,7 @@ def test_reward_is_the_decrease_of_the_error(estimator, name):
 
 
 @pytest.mark.parametrize(("name", "estimator", "observation"), [
-    *((name, "reduced", "raw") for name in INJECTION), (NAME, "reduced", "scaled"), (NAME, "none", "raw"),
-    (CURRENTS, "none", "raw")])
+    *((name, "reduced", "raw") for name in VECTORISED), (NAME, "reduced", "scaled"), (CURRENTS, "none", "raw")])
 def test_vectorised_as_single(name, estimator, observation):
     """18 vectorised and 18 single environments are bit-identical, also after an episode's end and with threads."""
     kwargs = {"num_envs": 18, "estimator": estimator, "episodes": 3, "observation": observation}
@@ -119,10 +120,9 @@ def test_vectorised_as_single(name, estimator, observation):
     assert begun >= 2                                                 # another episode has begun
 
 
-@pytest.mark.parametrize("name", [FAULTS, INFLOW])
-def test_episodes_are_independent_with_the_full_filter(name):
+def test_episodes_are_independent_with_the_full_filter():
     """An episode is bit-identical alone and together with another one."""
-    alone, beside = (make_many(name, n, estimator="full") for n in (1, 2))
+    alone, beside = (make_many(FAULTS, n, estimator="full") for n in (1, 2))
     shown = [(alone.reset(seed=[0])[0], beside.reset(seed=[0, 1])[0])]
     for action in (7, 40):
         first, pay, *_ = alone.step(np.array([action]))
@@ -150,20 +150,13 @@ def test_an_estimate_that_is_not_finite_is_an_error(monkeypatch):
         assert env.step(7)[1] == 0.0
     with pytest.raises(FloatingPointError, match=rf"state {17 + unscored} is not finite.* \[4\]"):
         env.step(7)
-    many = make_many(num_envs=3, estimator="reduced")
-    many.reset(seed=[1, 3, 4])
-    for _ in range(unscored):
-        many.step(np.full(3, 7))
-    with pytest.raises(FloatingPointError, match=r"not finite in the episodes \[4\]"):
-        many.step(np.full(3, 7))
 
 
-@pytest.mark.parametrize("name", [NAME, FLOW])
-def test_frames_change_with_what_is_known(name):
+def test_frames_change_with_what_is_known():
     """The image shows the last injection, without an estimator the expected concentration; None without a mode."""
     pictures = []
     for estimator in ("none", "reduced"):
-        env = make(estimator, name, render_mode="rgb_array").unwrapped
+        env = make(estimator, render_mode="rgb_array").unwrapped
         with pytest.raises(gym.error.ResetNeeded, match=r"call reset\(\) before render\(\)"):
             env.render()
         env.reset(seed=1)
@@ -177,24 +170,13 @@ def test_frames_change_with_what_is_known(name):
     assert len({picture.tobytes() for picture in pictures}) == 4
 
 
-def test_one_action_may_be_an_array():
-    """The action may have no axes, like actions of stable-baselines3's models for a single observation."""
-    env = make("reduced")
-    steps = []
-    for action in (7, np.array(7)):
-        assert env.action_space.contains(np.asarray(action))
-        env.reset(seed=1)
-        steps.append(env.step(action)[:2])
-    assert steps[0][1] == steps[1][1]
-    assert (steps[0][0]["voltages"] == steps[1][0]["voltages"]).all()
-
-
 def test_wrong_actions_are_named():
     """Actions other than the 120 pairs are rejected."""
     env = make().unwrapped
     env.reset(seed=1)
     message = "action must be an integer of at least 0 and at most 119"
-    for action in (-1, 120, 1.5, True, "first", np.array([7]), np.array(np.timedelta64(3, "ns")), np.array(3.0 + 0.0j)):
+    env.step(np.array(7))                                             # as from stable-baselines3's models
+    for action in (-1, 120, 1.5, True, "first", np.array([7]), np.array(3.0 + 0.0j)):
         with pytest.raises(ValueError, match=message):
             env.step(action)
     many = make_many(estimator="none")

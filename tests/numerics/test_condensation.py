@@ -1,6 +1,5 @@
 """Sparse systems condensed onto their last unknowns, against dense inverses."""
 
-import pickle
 import sys
 from concurrent.futures import ThreadPoolExecutor
 
@@ -39,7 +38,13 @@ def random_matrices(pattern: sp.csc_array, count: int, seed: int) -> list[np.nda
     return matrices
 
 
-@pytest.mark.parametrize(("n", "n_ports"), [(5, 1), (30, 3), (180, 7), (400, 15), (400, 17)])
+def inverses(system: Condensation, values: np.ndarray) -> np.ndarray:
+    """Return the ports' blocks of any number of matrices."""
+    return np.concatenate([system.port_inverse(values[:, k:k + system.batch])
+                           for k in range(0, values.shape[1], system.batch)])
+
+
+@pytest.mark.parametrize(("n", "n_ports"), [(5, 1), (30, 3), (180, 15), (200, 17)])
 def test_dense_inverse(n, n_ports):
     """The ports' block and columns of K⁻¹ equal the dense inverse, for one matrix and for many."""
     pattern = random_pattern(n, n_ports, seed=n)
@@ -48,7 +53,7 @@ def test_dense_inverse(n, n_ports):
     values = np.stack([K[system.rows, system.columns] for K in matrices], axis=1)
     exact = np.linalg.inv(np.array(matrices))
     tiny = 1e-12 * exact.max()
-    assert_allclose(system.port_inverse(values), exact[:, -n_ports:, -n_ports:], rtol=0, atol=tiny)
+    assert_allclose(inverses(system, values), exact[:, -n_ports:, -n_ports:], rtol=0, atol=tiny)
     for column, inverse in zip(values.T, exact, strict=True):
         block = inverse[-n_ports:, -n_ports:]
         assert_allclose(system.port_inverse(column), block, rtol=0, atol=tiny)
@@ -85,21 +90,11 @@ def test_wide_fronts_are_taken_one_by_one(monkeypatch):
     pattern = random_pattern(180, 7, seed=2)
     system = Condensation(pattern, 7)
     values = np.stack([K[system.rows, system.columns] for K in random_matrices(pattern, 3, seed=5)], axis=1)
-    together = system.port_inverse(values)
+    together = inverses(system, values)
     monkeypatch.setattr(condensation, "_WIDEST", 0)
     alone = Condensation(pattern, 7)
     assert alone.batch == 1
-    assert_allclose(alone.port_inverse(values), together, rtol=1e-12, atol=0)
-
-
-def test_entries_are_complete():
-    """The requested entries form the pattern: at least one triangle, no duplicates, no other entries."""
-    pattern = random_pattern(120, 5, seed=3)
-    system = Condensation(pattern, 5)
-    entries = (np.ones(len(system.rows)), (system.rows, system.columns))
-    asked = sp.coo_array(entries, shape=pattern.shape).toarray()
-    assert asked.max() == 1.0
-    assert_array_equal(np.maximum(asked, asked.T), pattern.toarray())
+    assert_allclose(inverses(alone, values), together, rtol=1e-12, atol=0)
 
 
 def test_a_state_keeps_its_bits_wherever_it_stands_in_a_batch():
@@ -107,8 +102,8 @@ def test_a_state_keeps_its_bits_wherever_it_stands_in_a_batch():
     pattern = random_pattern(200, 6, seed=4)
     system = Condensation(pattern, 6)
     values = np.stack([K[system.rows, system.columns] for K in random_matrices(pattern, 20, seed=5)], axis=1)
-    whole = system.port_inverse(values)
-    backwards = system.port_inverse(values[:, ::-1])[::-1]
+    whole = inverses(system, values)
+    backwards = inverses(system, values[:, ::-1])[::-1]
     assert_array_equal(whole, backwards)
     assert_array_equal(system.port_inverse(values[:, :3]), whole[:3])
     assert_array_equal(system.port_inverse(values[:, 13:14]), whole[13:14])
@@ -119,28 +114,18 @@ def test_systems_and_threads_do_not_disturb_each_other():
     systems = []
     values = []
     alone = []
-    for k, n in enumerate((60, 300, 150, 420)):
+    for k, n in enumerate((60, 200, 150)):
         pattern = random_pattern(n, 5, seed=k)
         system = Condensation(pattern, 5)
         K, = random_matrices(pattern, 1, seed=k)
         systems.append(system)
         values.append(K[system.rows, system.columns])
         alone.append(system.port_columns(values[-1]))
-    jobs = [k % 4 for k in range(400)]
+    jobs = [k % 3 for k in range(120)]
     with ThreadPoolExecutor(4) as pool:
         together = list(pool.map(lambda k: systems[k].port_columns(values[k]), jobs))
     for k, columns in zip(jobs, together, strict=True):
         assert_array_equal(columns, alone[k])
-
-
-def test_pickled():
-    """A system sent to another process gives the same numbers."""
-    pattern = random_pattern(90, 4, seed=6)
-    system = Condensation(pattern, 4)
-    K, = random_matrices(pattern, 1, seed=7)
-    values = K[system.rows, system.columns]
-    sent = pickle.loads(pickle.dumps(system))
-    assert_array_equal(sent.port_inverse(values), system.port_inverse(values))
 
 
 def test_numba_that_does_not_work_is_named(monkeypatch):

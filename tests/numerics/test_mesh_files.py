@@ -53,28 +53,26 @@ def test_round_trip(dim, tmp_path):
     assert_array_equal(small.groups["inlet"], groups["inlet"])
 
 
-@in_both_dimensions
-@pytest.mark.parametrize(("format", "ending", "binary"), [
-    ("gmsh22", "msh", True), ("gmsh22", "msh", False), ("vtk", "vtk", True), ("vtu", "vtu", True)])
-def test_other_formats(dim, format, ending, binary, tmp_path):
+@pytest.mark.parametrize(("dim", "format", "ending"), [(2, "gmsh22", "msh"), (3, "vtk", "vtk"), (3, "vtu", "vtu")])
+def test_other_formats(dim, format, ending, tmp_path):
     """Formats of meshio are read; a file without groups has an empty dictionary."""
     mesh = MESHES[dim]
     file = tmp_path / f"box.{ending}"
     points = np.pad(mesh.points, ((0, 0), (0, 3 - dim)))
     meshio.Mesh(points, [("triangle" if dim == 2 else "tetra", mesh.cells)]).write(
-        file, file_format=format, binary=binary)
+        file, file_format=format, binary=True)
     read = read_mesh(file)
     assert_array_equal(read.mesh.points, mesh.points)
     assert_array_equal(read.mesh.cells, mesh.cells)
     assert read.groups == {}
 
 
-@pytest.mark.parametrize("turn", [str.lower, str.upper])
-def test_the_right_file_is_read(turn, tmp_path):
+def test_the_right_file_is_read(tmp_path):
     """A SHA-256 is accepted in upper and lower case; an error for another file contains both."""
     write_mesh(tmp_path / "box.msh", MESHES[2])
     sha256 = hashlib.sha256((tmp_path / "box.msh").read_bytes()).hexdigest()
-    assert read_mesh(tmp_path / "box.msh", turn(sha256)).mesh.n_nodes == MESHES[2].n_nodes
+    for digits in (sha256, sha256.upper()):
+        assert read_mesh(tmp_path / "box.msh", digits).mesh.n_nodes == MESHES[2].n_nodes
     other = "0" * 64
     with pytest.raises(ValueError, match=f"box.msh: must be .* SHA-256 {other}, got .* {sha256}"):
         read_mesh(tmp_path / "box.msh", other)
@@ -167,23 +165,16 @@ def written(folder: Path, text: str) -> Path:
     return file
 
 
-def test_gmsh_22(tmp_path):
-    """Unused nodes are left out, the others keep their order; facets go by their group's name."""
-    mesh, groups = read_mesh(written(tmp_path, SQUARE))
+@pytest.mark.parametrize("z", ["0", "5"])
+def test_gmsh_22(z, tmp_path):
+    """Unused nodes are left out, the others keep their order; facets go by their group's name. Any plane will do."""
+    mesh, groups = read_mesh(written(tmp_path, re.sub(r"^(\d+ \d \d) 0$", rf"\1 {z}", SQUARE, flags=re.M)))
     assert_array_equal(mesh.points, [[0, 0], [2, 0], [2, 1], [0, 1]])
     assert_array_equal(mesh.cells, [[0, 1, 2], [0, 2, 3]])
     assert mesh.volumes.sum() == 2.0
     assert list(groups) == ["electrode 1", "walls"]
     assert_array_equal(groups["electrode 1"], [[0, 1], [2, 3]])
     assert_array_equal(groups["walls"], [[0, 3], [1, 2]])
-
-
-def test_a_plane_elsewhere(tmp_path):
-    """A mesh in the plane z = 5 is the same as in the plane z = 0."""
-    text = re.sub(r"^(\d+ \d \d) 0$", r"\1 5", SQUARE, flags=re.M)
-    assert text != SQUARE
-    moved, mesh = (read_mesh(written(tmp_path, each)).mesh for each in (text, SQUARE))
-    np.testing.assert_array_equal(moved.points, mesh.points)
 
 
 def test_gmsh_41(tmp_path):
@@ -218,13 +209,10 @@ def with_elements(*elements: str) -> str:
 
 @pytest.mark.parametrize(("text", "match"), [
     (with_elements(), "must hold only straight triangles, .* got line, vertex"),
-    (with_elements("3 2 3 1 20 30 40 50"), "got line, quad"),
-    (with_elements("4 2 3 1 20 30 50 60", "5 2 3 1 20 30 40 50 20 30 40 50"), "got hexahedron, line, tetra"),
     (with_elements("9 2 3 1 20 30 40 10 10 10"), "got line, triangle6"),
     (with_elements("2 2 3 1 20 30 40", "8 2 1 1 20 30 10"), "got line, line3, triangle"),
     (with_elements("2 2 3 1 20 30 40", "2 2 3 1 20 40 60"), "in a plane z = constant"),
-    (SQUARE.replace("40 2 1 0", "40 2 0 0"), r"nodes must have different coordinates, got several at \(2, 0, 0\)"),
-    (with_elements("2 2 3 1 20 30 30"), "cells must have a positive volume"),
+    (SQUARE.replace("40 2 1 0", "40 2 0 0"), r"nodes must have different coordinates, got .* at \[2.0, 0.0, 0.0\]"),
     (with_elements("2 2 3 1 20 30 40"),
      "group 'electrode 1' must lie on the boundary, got 1 of 2 facets that do not"),
     (SQUARE.replace("3 1 2 2 2 40 30", "3 1 2 2 2 40 20"),
@@ -234,8 +222,7 @@ def with_elements(*elements: str) -> str:
     (SQUARE.replace('2 3 "fluid"', '2 3 "walls"'), "must have a name, which no group of another"),
     (SQUARE.replace('0 9 "corner"', '1 9 "outlet"'), "group 'outlet' must hold facets, got none"),
     (SQUARE[:-80], "must be a complete mesh file in a format that meshio reads"),
-    (SQUARE.replace("2.2 0 8", "1.0 0 8"), "cannot be read .*Need mesh format"),
-    ("a picture of a pipe", "must be a complete mesh file"), ("", "must be a complete mesh file"),
+    ("", "must be a complete mesh file"), (SQUARE.replace("2.2 0 8", "1.0 0 8"), "cannot be read .*Need mesh format"),
 ])
 def test_files_that_are_refused(text, match, tmp_path, capsys):
     """Messages contain the file, the problem and the expectation; nothing is printed."""
@@ -245,21 +232,15 @@ def test_files_that_are_refused(text, match, tmp_path, capsys):
     assert capsys.readouterr() == ("", "")
 
 
-@pytest.mark.parametrize("name", ["pipe.msh", "pipe.vtu", "", "pipe.xyzzy"])
-def test_files_that_are_not_there(name, tmp_path):
-    """A folder and an unknown suffix are rejected with the name."""
+def test_files_that_are_not_there(tmp_path):
+    """A folder, an unknown suffix and a wrong scale are rejected."""
     with pytest.raises(ValueError, match="file not found"):
-        read_mesh(tmp_path / name)
-    if name:
-        (tmp_path / name).write_text("nonsense")
-        with pytest.raises(ValueError, match=rf"{name}: must be a complete mesh file in a format"):
-            read_mesh(tmp_path / name)
-
-
-@pytest.mark.parametrize("scale", [0.0, -1.0, np.nan, "mm"])
-def test_scales_that_are_refused(scale, tmp_path):
+        read_mesh(tmp_path)
+    (tmp_path / "pipe.xyzzy").write_text("nonsense")
+    with pytest.raises(ValueError, match=r"pipe\.xyzzy: must be a complete mesh file in a format"):
+        read_mesh(tmp_path / "pipe.xyzzy")
     with pytest.raises(ValueError, match="scale must be a"):
-        read_mesh(written(tmp_path, SQUARE), scale=scale)
+        read_mesh(written(tmp_path, SQUARE), scale=-1.0)
 
 
 def test_without_meshio_the_extra_is_named(tmp_path, monkeypatch):

@@ -3,7 +3,7 @@
 import gymnasium as gym
 import numpy as np
 import pytest
-from eitbench.envs.rendering import draw_comparison
+from eitbench.envs.rendering import draw_frame
 from eitbench.report.animate import animate
 
 from short import FAST
@@ -15,7 +15,7 @@ def test_each_field_has_a_panel_of_its_own():
     task = env.task
     low, high = (np.full(task.mesh.n_nodes, factor * task.expected_concentration) for factor in (0.6, 1.8))
     fields = [(name, task.mesh, values) for name, values in (("Truth", high), ("A", low), ("B", high))]
-    frame = draw_comparison(task, fields, task.currents[0], 0.005)
+    frame = draw_frame(task, fields, task.currents[0], 0.005)
     assert frame.shape == (605, 720, 3) and frame.dtype == np.uint8
     shades = [frame[y, 360] for y in (100, 270, 445)]
     np.testing.assert_array_equal(shades[0], shades[2])

@@ -8,7 +8,6 @@ from matplotlib.collections import PolyCollection
 from matplotlib.colors import to_rgba_array
 
 from eitbench.numerics.mesh import Mesh
-from eitbench.physics.cem import CompleteElectrodeModel
 
 HIGH_COLOUR, LOW_COLOUR = "#e08e0b", "#2f6db5"
 _EYE = -np.linalg.qr(np.array([[0.30, 0.0, 1.0], [0.22, 1.0, 0.0], [0.9, -0.3, -0.3]]).T)[0].T
@@ -44,29 +43,17 @@ def draw_isosurfaces(axes: Axes, mesh: Mesh, values: np.ndarray, low: float, hig
     """Draw the surfaces of ``low`` (blue) and ``high`` (orange) mol/m³ in the pipe's outline."""
     surfaces = [isosurface(mesh, values, level) for level in (low, high)]
     colours = np.repeat([LOW_COLOUR, HIGH_COLOUR], list(map(len, surfaces)))
-    _draw(axes, np.concatenate(surfaces), colours, 0.5)
+    if len(colours):
+        _draw(axes, np.concatenate(surfaces), colours)
     _outline(axes, mesh)
 
 
-def draw_electrodes_in_space(axes: Axes, cem: CompleteElectrodeModel, currents: np.ndarray,
-                             colours: tuple[str, str, str]) -> None:
-    """Draw the electrodes on the wall in the colours of (source, sink, idle)."""
-    idle = np.concatenate([cem.mesh.points[facets] for facets in cem.electrodes])
-    _draw(axes, idle, np.repeat(colours[2], len(idle)), 0.3)
-    for k in np.flatnonzero(currents):
-        active = cem.mesh.points[cem.electrodes[k]]
-        _draw(axes, active, np.repeat(colours[0 if currents[k] > 0 else 1], len(active)), 1.0)
-    _outline(axes, cem.mesh)
-
-
-def _draw(axes: Axes, triangles: np.ndarray, colours: np.ndarray, alpha: float) -> None:
+def _draw(axes: Axes, triangles: np.ndarray, colours: np.ndarray) -> None:
     """Draw triangles (k, 3, 3) in m projected by `_EYE`, the furthest first, with shading."""
-    if not len(triangles):
-        return
     seen = 100.0 * triangles @ _EYE.T
     normal = np.cross(seen[:, 1] - seen[:, 0], seen[:, 2] - seen[:, 0])
     facing = np.abs(normal[:, 2]) / np.maximum(np.linalg.norm(normal, axis=1), 1e-300)
-    shaded = to_rgba_array(colours.tolist(), alpha)
+    shaded = to_rgba_array(colours.tolist(), 0.5)
     shaded[:, :3] *= (0.55 + 0.45 * facing)[:, None]
     order = np.argsort(seen[:, :, 2].mean(axis=1))
     axes.add_collection(PolyCollection(list(seen[order, :, :2]), facecolors=shaded[order],
