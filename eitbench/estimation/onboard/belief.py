@@ -9,7 +9,6 @@ import numpy as np
 
 from eitbench.data.episode_cache import scoring_constants
 from eitbench.estimation.design import pair_design_criteria, symmetric_entries
-from eitbench.estimation.onboard.body_belief import BodyBelief, PolicyBelief
 from eitbench.estimation.onboard.linearisation import linearisation_table
 from eitbench.estimation.onboard.reduced_filters import ReducedFilters
 
@@ -23,7 +22,7 @@ FAULT_DECAY = 0.8
 """Factor per step of the score after failed injections, while the electrode is not driven."""
 
 
-class Belief(PolicyBelief):
+class Belief:
     """Covariance of the environment's filter, and the design criteria of each injection.
 
     It is created from the first raw observation of an episode and updated with every later one. The
@@ -273,11 +272,6 @@ class Belief(PolicyBelief):
     @property
     def _noise_variance(self) -> np.ndarray:
         return _noise_variance(self.rules, self.linearisation.resistance.tobytes())
-
-
-def belief_class(rules: Rules) -> type[Belief] | type[BodyBelief]:
-    """Return the class of a policy's belief for these rules."""
-    return BodyBelief if rules.tracks_body else Belief
 
 
 @lru_cache(maxsize=64)

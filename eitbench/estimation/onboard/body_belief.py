@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy.sparse as sp
@@ -16,20 +16,7 @@ if TYPE_CHECKING:
     from eitbench.estimation.onboard.rules import Rules
 
 
-class PolicyBelief:
-    """Belief of a policy, which begins with the first raw observation of an episode."""
-
-    @classmethod
-    def create_or_update(cls: Any, belief: Any, rules: Rules,
-                         observation: dict[str, np.ndarray]) -> Any:
-        """Return a new belief from the first observation of an episode, or the updated one."""
-        if belief is None:
-            return cls(rules, observation)
-        belief.update(observation)
-        return belief
-
-
-class BodyBelief(PolicyBelief):
+class BodyBelief:
     """Particles of the environment's filter, and the design criteria of each injection.
 
     It is created from the first raw observation of an episode and updated with every later one.
