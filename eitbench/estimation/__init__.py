@@ -40,6 +40,7 @@ from eitbench.estimation.gaussian import LinearMeasurement, condition, innovate
 from eitbench.estimation.homogeneous import best_homogeneous
 from eitbench.estimation.identification import identify_model
 from eitbench.estimation.identified import IdentifiedModel, compatible_models
+from eitbench.estimation.inflow_estimator import InflowEstimator
 from eitbench.estimation.inflow_map import full_window_filter, map_inflow, maximise_posterior
 from eitbench.estimation.inflow_prior import (
     InflowPrior,
@@ -87,7 +88,8 @@ from eitbench.estimation.velocity import (
 __all__ = [
     "BodyTracker", "CalibrationFrame", "DenseCovariance", "EnsembleFilter", "Filter",
     "FilterEstimator", "FilterFeatures", "FrameEstimator", "IdentifiedModel", "ImpulseResponse",
-    "InflowPrior", "InflowWindow", "LinearMeasurement", "LinearisedForwardModel", "LogStates",
+    "InflowEstimator", "InflowPrior", "InflowWindow", "LinearMeasurement",
+    "LinearisedForwardModel", "LogStates",
     "LowRankCovariance", "Motion", "NetworkCorrectedFilter", "NodalStates",
     "OpenLoopCovariance", "ParticleInflowFilter", "QuadraticVoltageModel", "RecordSmoother",
     "Regimes", "ScaledVoltageModel", "StateSpace", "StationaryMap", "Step",
