@@ -37,7 +37,7 @@ class FullFilters(EpisodeFilters):
         self._filters = [Filter(space, gate=rules.gate) for _ in range(episodes)]
         self._last: list[Step | None] = [None] * episodes
 
-    def assimilate(self, voltages: np.ndarray,
+    def _condition(self, voltages: np.ndarray,
                    currents: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         innovations = np.zeros_like(voltages)
         accepted = np.ones(voltages.shape, dtype=bool)
