@@ -22,6 +22,7 @@ from eitbench.estimation.estimators import (
     FilterEstimator,
     FrameEstimator,
     RecordSmoother,
+    SequentialEstimator,
 )
 from eitbench.estimation.filter import Filter, StateSpace, Step, kalman_filter
 from eitbench.estimation.forward import (
@@ -66,7 +67,6 @@ from eitbench.estimation.nodal import (
     modal_states,
     nodal_filter,
     nodal_states,
-    table_5_1_filter,
 )
 from eitbench.estimation.quadratic_voltages import QuadraticVoltageModel, ScaledVoltageModel
 from eitbench.estimation.smoother import (
@@ -92,7 +92,7 @@ __all__ = [
     "LinearisedForwardModel", "LogStates",
     "LowRankCovariance", "Motion", "NetworkCorrectedFilter", "NodalStates",
     "OpenLoopCovariance", "ParticleInflowFilter", "QuadraticVoltageModel", "RecordSmoother",
-    "Regimes", "ScaledVoltageModel", "StateSpace", "StationaryMap", "Step",
+    "Regimes", "ScaledVoltageModel", "SequentialEstimator", "StateSpace", "StationaryMap", "Step",
     "SwitchingInflowFilter", "UnscentedFilter", "VelocityInflowWindow", "VelocityPrior",
     "VelocityStates", "VoltageFeatures", "apply_correction", "best_homogeneous",
     "compatible_models", "compatible_priors", "condition", "fit_inflow_prior",
@@ -102,6 +102,6 @@ __all__ = [
     "linearise_at_reference", "linearise_voltages", "load_network", "map_inflow",
     "maximise_posterior", "modal_states", "network_matches_task", "nodal_filter",
     "nodal_states", "one_step", "reduced_response", "scaled_velocity_prior", "smooth_means",
-    "smooth_state", "smoothness_covariance", "steady_response", "table_5_1_filter",
-    "task_velocity_prior", "time_varying_responses", "total_variation", "velocity_states",
+    "smooth_state", "smoothness_covariance", "steady_response", "task_velocity_prior",
+    "time_varying_responses", "total_variation", "velocity_states",
 ]

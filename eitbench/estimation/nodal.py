@@ -149,10 +149,13 @@ class LogStates(StateSpace):
         return self.concentration(mean)**2 * variance
 
 
-def nodal_states(transport: Transport, prior: Prior, c_ref: float) -> NodalStates:
+def nodal_states(transport: Transport, prior: Prior, c_ref: float,
+                 rank_tolerance: float = FILTER_RANK_TOLERANCE) -> NodalStates:
     """Return the state space of a target's concentration with the parameters of Table 5.1.
 
-    `table_5_1_filter` uses it for a vessel with an inlet. Without an inlet the open-loop covariance
+    The evolution is c⁺ = F c + Y c_in + w. Inflow and initial state have mean ĉ_bh; Γ_η and Γ_e are
+    diagonal, Γ_{0|0} is diagonal or smooth. As all of them scale with ĉ_bh², the open-loop
+    covariance is computed once per transport model and used in all episodes. Without an inlet it
     has no limit, and the covariance is dense.
 
     Parameters
@@ -163,10 +166,14 @@ def nodal_states(transport: Transport, prior: Prior, c_ref: float) -> NodalState
         `Task.prior`.
     c_ref : float
         Best homogeneous estimate ĉ_bh in mol/m³.
+    rank_tolerance : float
+        As in `LowRankCovariance`, with an inlet.
     """
-    if len(transport.inlet) and not isinstance(transport, StationaryTransport):
-        return _flowing_states(transport, prior, c_ref)
     mean = np.full(transport.mesh.n_nodes, c_ref)
+    if len(transport.inlet) and not isinstance(transport, StationaryTransport):
+        F, Y = transport.transition()
+        flowing = LowRankCovariance(_open_loop(transport, prior), rank_tolerance, c_ref**2)
+        return NodalStates(mean, flowing, Motion(F, Y.sum(axis=1) * c_ref))
     if isinstance(transport, RandomWalk):
         motion = Motion(transport.step, noise=(c_ref * prior.nodal_std)**2 * transport.covariance)
     elif isinstance(transport, StationaryTransport):
@@ -200,28 +207,10 @@ def modal_states(n_modes: int, std: float,
     return NodalStates(np.zeros(order * n_modes), covariance, motion_at)
 
 
-def nodal_filter(transport: Transport, prior: Prior, c_ref: float,
-                 forward: Forward | None = None) -> Filter:
+def nodal_filter(transport: Transport, prior: Prior, c_ref: float, forward: Forward | None = None,
+                 rank_tolerance: float = FILTER_RANK_TOLERANCE) -> Filter:
     """Return a filter of `nodal_states` at t = 0."""
-    return Filter(nodal_states(transport, prior, c_ref), forward)
-
-
-def table_5_1_filter(transport: Transport, prior: Prior, c_ref: float, *,
-                     rank_tolerance: float = FILTER_RANK_TOLERANCE) -> Filter:
-    """Return the Kalman filter of c⁺ = F c + Y c_in + w; arguments as in `nodal_states`.
-
-    Inflow and initial state have mean ĉ_bh; Γ_η and Γ_e are diagonal, Γ_{0|0} is diagonal or
-    smooth. As all of them scale with ĉ_bh², the open-loop covariance is computed once per transport
-    model and used in all episodes.
-    """
-    return Filter(_flowing_states(transport, prior, c_ref, rank_tolerance))
-
-
-def _flowing_states(transport: Transport, prior: Prior, c_ref: float,
-                    rank_tolerance: float = FILTER_RANK_TOLERANCE) -> NodalStates:
-    F, Y = transport.transition()
-    covariance = LowRankCovariance(_open_loop(transport, prior), rank_tolerance, c_ref**2)
-    return NodalStates(np.full(len(F), c_ref), covariance, Motion(F, Y.sum(axis=1) * c_ref))
+    return Filter(nodal_states(transport, prior, c_ref, rank_tolerance), forward)
 
 
 def flow_motion(task: Task, transition: tuple[np.ndarray, np.ndarray], c_ref: float) -> Motion:

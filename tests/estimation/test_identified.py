@@ -13,7 +13,6 @@ from eitbench.estimation import (
     CalibrationFrame,
     IdentifiedModel,
     LinearMeasurement,
-    QuadraticVoltageModel,
     compatible_models,
     full_window_filter,
     identify_model,
@@ -249,38 +248,3 @@ def test_invalid_files_are_rejected(tmp_path):
         replace(model(), residual_covariance=np.eye(3))
     with pytest.raises(ValueError, match=r"voltage_error_covariance must have shape"):
         replace(model(), voltage_error_covariance=np.eye(4))
-
-
-@lru_cache(maxsize=1)
-def quadratic():
-    return QuadraticVoltageModel(task().observation, LEVEL, model().basis)
-
-
-def along_modes(size):
-    """Return a concentration with a deviation of ``size`` in some modes of its logarithm."""
-    a = np.random.default_rng(7).standard_normal(model().basis.shape[1])
-    u = model().basis @ a
-    return LEVEL * np.exp(size * u / np.abs(u).max())
-
-
-def test_quadratic_voltages_are_of_second_order():
-    """Half the contrast along the modes has an eighth of the error, of third order; the voltages at c_0 are exact."""
-    I = task().currents
-
-    def off(size):
-        c = along_modes(size)
-        return np.linalg.norm(quadratic().voltages(c, I) - task().observation.voltages(c, I))
-
-    assert off(0.0) < 1e-12
-    assert 6.0 < off(0.2) / off(0.1) < 10.0
-
-
-def test_derivatives_of_quadratic_voltages():
-    """Derivatives agree with finite differences along the modes and at all nodes."""
-    I = task().currents
-    c = along_modes(0.2)
-    _, by_c = quadratic().linearise(c, I)
-    for seed in range(3):
-        step = 1e-4 * np.random.default_rng(seed).standard_normal(len(c))
-        change = (quadratic().voltages(c + step, I) - quadratic().voltages(c - step, I)) / 2
-        np.testing.assert_allclose(by_c @ step, change, atol=1e-6 * np.abs(change).max())

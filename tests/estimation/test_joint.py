@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from eitbench.estimation import Filter, LinearMeasurement, VelocityPrior, VelocityStates
+from eitbench.estimation import DenseCovariance, Filter, LinearMeasurement, VelocityPrior, VelocityStates
 from models import MESH, averages, coarse_transport, directions, shapes, textbook_update, theta_of
 
 C_BH, N = 30.0, 147
@@ -75,7 +75,7 @@ def test_one_step_equals_the_textbook():
 
 
 def test_covariance_moves_with_the_derivative_of_the_prediction():
-    """Without noise the covariance becomes A Γ Aᵀ, with A the finite differences of `predict` by (c, θ)."""
+    """Without noise the covariance G Gᵀ becomes A G Gᵀ Aᵀ, with A G finite differences of `predict` by (c, θ)."""
     rng, k, h = np.random.default_rng(3), 3, 1e-4
     c, theta = C_BH + 3 * rng.normal(size=N), np.array([4.0, 1.0, 0.4])
     quiet = {"nodal_noise": np.zeros((N, N)), "inflow_std": 0.0, "walk_std": np.zeros(k)}
@@ -85,19 +85,17 @@ def test_covariance_moves_with_the_derivative_of_the_prediction():
         filter_.predict()
         return filter_.mean
 
-    start = np.concatenate([c, theta])
-    A = np.stack([(predicted(start + e) - predicted(start - e)) / (2 * h) for e in h * np.eye(N + k)], axis=1)
-    root = rng.normal(size=(N, N))
-    filter_ = joint_filter(k, mean=c, start=theta, covariance=root @ root.T / N, start_std=np.array([1.0, 0.7, 0.4]),
-                           **quiet)
-    before = filter_.covariance.array.copy()
+    start, G = np.concatenate([c, theta]), rng.normal(size=(8, N + k))
+    moved = np.stack([(predicted(start + h * g) - predicted(start - h * g)) / (2 * h) for g in G], axis=1)
+    filter_ = joint_filter(k, mean=c, start=theta, **quiet)
+    filter_.covariance = DenseCovariance(G.T @ G)
     filter_.predict()
-    expected = A @ before @ A.T
+    expected = moved @ moved.T
     assert np.abs(expected[:N, N:]).max() > 0.1                                         # the velocity shows
     np.testing.assert_allclose(filter_.covariance.array, expected, atol=1e-7 * np.abs(expected).max())
 
 
-@pytest.mark.parametrize("truth", [[3.2], [5.8], [4.0, 1.2, 0.4]], ids=["slow", "fast", "skew"])
+@pytest.mark.parametrize("truth", [[3.2], [4.0, 1.2, 0.4]], ids=["slow", "skew"])
 def test_velocity_is_estimated(truth):
     """For a truth of the filter's model, one to two σ from the prior, θ is within 3σ and the profile within 5 %."""
     rng, truth = np.random.default_rng(4), np.array(truth)
@@ -116,8 +114,7 @@ def test_velocity_is_estimated(truth):
     assert np.linalg.norm(shapes(k) @ miss) < 0.05 * np.linalg.norm(shapes(k) @ truth)
 
 
-@pytest.mark.parametrize(("k", "far"), [(1, -8.0), (1, 40.0), (3, -8.0), (3, 40.0)],
-                         ids=["backwards", "too fast", "skew backwards", "skew too fast"])
+@pytest.mark.parametrize(("k", "far"), [(1, -8.0), (3, 40.0)], ids=["backwards", "skew too fast"])
 def test_velocity_stays_within_its_bounds(k, far):
     """If a measurement implies a θ beyond the bounds, θ is at the bound on the line from θ_0; c is not constrained."""
     filter_, observation = started(np.random.default_rng(5), k)
@@ -145,10 +142,10 @@ def test_velocity_stays_within_its_bounds(k, far):
 
 @pytest.mark.parametrize(("changes", "name"), [
     ({"mean": np.zeros((N, 1))}, "^mean"), ({"covariance": np.eye(N - 1)}, "^covariance"),
-    ({"start": np.array([4.5, 0.0])}, "^initial"), ({"start": np.array([np.nan])}, "^initial"),
-    ({"inflow_std": -1.0}, "^inflow_std"), ({"nodal_noise": np.ones(N)}, "^nodal_noise"),
-    ({"profiles": np.ones((5, 2))}, "^profiles"), ({"profiles": np.zeros((5, 1))}, "^profiles"),
-    ({"bounds": (0.0, 5.0)}, "^bounds"), ({"bounds": (0.1, 0.9)}, "^bounds"), ({"bounds": (1.5, 2.0)}, "^bounds"),
+    ({"start": np.array([4.5, 0.0])}, "^initial"), ({"inflow_std": -1.0}, "^inflow_std"),
+    ({"walk_std": np.array([0.1, 0.1])}, "^walk_std"), ({"nodal_noise": np.ones(N)}, "^nodal_noise"),
+    ({"profiles": -np.ones((5, 1))}, r"^profiles must give a positive velocity with initial, got -4\.5"),
+    ({"bounds": (0.0, 5.0)}, "^bounds must be a range"), ({"bounds": (1.5, 2.0)}, "^bounds must be a range"),
 ])
 def test_errors_name_the_argument(changes, name):
     """Wrong shapes, profiles at walls, and bounds that exclude the nominal velocity raise an error with the name."""

@@ -18,13 +18,11 @@ from eitbench.estimation import (
 from eitbench.worlds.catalogue import PIPE_2D_SKEWED, STATIONARY_TANK_2D
 from eitbench.worlds.task import make_task
 from models import MESH, averages, coarse_transport, directions, shapes, theta_of, two_modes, white_inflow
+from scipy.linalg import toeplitz
 
 from tiny_worlds import TINY
 
 LEVEL, N = 29.0, 147
-
-
-DIRECTIONS = directions(2)
 
 
 def transport_at(theta):
@@ -33,7 +31,7 @@ def transport_at(theta):
 
 def flow(std=(1.0, 2.0), walk=(0.05, 0.02)):
     """Return the prior of v = θ_1 v_1 + θ_2 v_2 with nominal mean 4.5 m/s, a residence time of 18 steps."""
-    return VelocityPrior(transport_at, DIRECTIONS, np.array([4.5, 0.0]), np.array(std), np.array(walk), shapes(2))
+    return VelocityPrior(transport_at, directions(2), np.array([4.5, 0.0]), np.array(std), np.array(walk), shapes(2))
 
 
 def started(belief, window, law=None):
@@ -114,20 +112,18 @@ def test_a_white_inflow_gives_the_joint_filter():
     assert np.linalg.norm(theta_of(filter_)[0] - belief.initial) > 0.1
 
 
-@pytest.mark.parametrize("truth", [[3.4, 0.0], [5.0, 1.2]], ids=["slow", "skew"])
-def test_velocity_is_estimated(truth):
+def test_velocity_is_estimated():
     """For inflows sampled from the prior and a velocity one to two σ from its mean, θ is within 5 % and within 3σ."""
-    random = np.random.default_rng(3)
-    process = np.linalg.cholesky(np.array([[prior().time_covariance(80)[abs(i - j)] for i in range(80)]
-                                           for j in range(80)])) @ random.standard_normal((80, 2))
-    filter_ = started(flow(walk=(0.0, 0.0)), 30)
+    random, truth = np.random.default_rng(3), np.array([5.0, 1.2])
+    process = np.linalg.cholesky(toeplitz(prior().time_covariance(60))) @ random.standard_normal((60, 2))
+    filter_ = started(flow(walk=(0.0, 0.0)), 24)
     transport = transport_at(truth)
     c, before = np.full(N, LEVEL), LEVEL
     for t, x in enumerate(process):
         after = LEVEL * np.exp(prior().modes @ x)
         c = transport.step(c, before, after)
         before = after
-        if t < 30:
+        if t < 24:
             continue
         (seen,) = observations(1, seed=t)
         filter_.predict()
@@ -173,13 +169,7 @@ def test_invalid_arguments_are_rejected():
         task_velocity_prior(task())
     with pytest.raises(ValueError, match="task must have a flow, got StationaryTransport"):
         scaled_velocity_prior(make_task(STATIONARY_TANK_2D), 0.3, 0.0)
-    with pytest.raises(ValueError, match="walk_std"):
-        flow(walk=(0.1,))
-    with pytest.raises(ValueError, match=r"profiles must give a positive velocity with initial, got -4\.5"):
-        replace(flow(), profiles=-np.ones((3, 2)))
     with pytest.raises(ValueError, match="window"):
         started(flow(), 0)
-    with pytest.raises(ValueError, match="bounds must be a range"):
-        replace(flow(), bounds=(0.5, 0.9))
     with pytest.raises(ValueError, match="the prior must be for the task's inlet"):
         VelocityInflowWindow(make_task(TINY), prior(), LEVEL, flow(), 12)

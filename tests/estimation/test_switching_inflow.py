@@ -6,7 +6,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from eitbench.estimation import (
-    Filter,
     InflowPrior,
     LinearMeasurement,
     ParticleInflowFilter,
@@ -169,23 +168,6 @@ def test_particles_that_cover_all_sequences_are_exact():
     np.testing.assert_allclose(shortened.variance, variance, rtol=0.05)
 
 
-def test_particles_of_one_regime_are_a_kalman_filter():
-    """For a slug that never ends, mean, variance and innovations equal the Kalman filter to 1e-9."""
-    ours = particles(1.0, 1e-14, count=2)
-    one = Filter(switching(1.0, 1e-14).filters[1].space)
-    one.covariance = switching(1.0, 1e-14).filters[1].covariance
-    measured = list(observations(5))
-    filtered(ours, measured)
-    for seen in measured:
-        one.predict()
-        step = one.update(seen)
-    estimate = ours.estimate()
-    np.testing.assert_allclose(estimate.mean, one.concentration, rtol=1e-9)
-    np.testing.assert_allclose(estimate.variance, one.variance, rtol=1e-9)
-    np.testing.assert_allclose(estimate.innovation, step.innovation, atol=1e-9)
-    np.testing.assert_allclose(estimate.innovation_covariance, step.innovation_covariance, rtol=1e-9)
-
-
 def test_few_particles_are_closer_to_enumeration_than_mixing():
     measured = list(observations(5))
     _, mean, variance = enumerated(switching(0.1, 0.2), Regimes(0.1, 0.2, 1e-3), measured)
@@ -199,12 +181,12 @@ def test_resampling_is_unbiased():
     random = np.random.default_rng(3)
     weights = random.dirichlet(np.full(20, 0.3))
     total = np.zeros(20)
-    for _ in range(4000):
+    for _ in range(2000):
         kept, new = resample(weights, 6, random)
         assert len(set(kept)) == 6
         np.testing.assert_allclose(new.sum(), 1.0)
         total[kept] += new
-    np.testing.assert_allclose(total / 4000, weights, atol=0.005)
+    np.testing.assert_allclose(total / 2000, weights, atol=0.007)
     for few, count in ((weights[:6], 6), (np.array([1.0, 0.0, 0.0]), 2)):
         kept, new = resample(few, count, random)
         np.testing.assert_allclose(new.sum(), few.sum())

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from functools import cached_property, lru_cache
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -96,8 +96,8 @@ class Belief:
 
     def _clear_cache(self) -> None:
         self._steps: list[tuple[np.ndarray, ...]] = []
-        vars(self).pop("linearisation", None)
-        vars(self).pop("_weight", None)
+        for cached in ("linearisation", "_weight", "_noise_variance"):
+            vars(self).pop(cached, None)
 
     @property
     def _state(self) -> np.ndarray:
@@ -269,17 +269,11 @@ class Belief:
         half = self._by_state(state, self._shared.weight[None])[0]
         return self._by_state(state, half.T[None])[0]
 
-    @property
+    @cached_property
     def _noise_variance(self) -> np.ndarray:
-        return _noise_variance(self.rules, self.linearisation.resistance.tobytes())
-
-
-@lru_cache(maxsize=64)
-def _noise_variance(rules: Rules, resistance: bytes) -> np.ndarray:
-    """Return the noise variance (pairs, L) of the voltages of each pair, per current squared."""
-    i, j = rules.pairs.T
-    R = np.frombuffer(resistance).reshape(rules.pairs.max() + 1, -1)
-    table = linearisation_table(rules.world)
-    std = [table.noise_std(rules.amplitude * column, rules.instrument.noise_floor)
-           for column in R[i] - R[j]]
-    return (np.array(std) / rules.amplitude)**2
+        """(pairs, L) noise variance of the voltages of each pair, per current squared."""
+        i, j = self.rules.pairs.T
+        R = self.linearisation.resistance
+        voltages = self.rules.amplitude * (R[i] - R[j])
+        std = self._filters.table.noise_std(voltages, self.rules.instrument.noise_floor)
+        return np.square(std / self.rules.amplitude)
