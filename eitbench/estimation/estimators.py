@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
@@ -50,21 +50,11 @@ class CalibrationFrame:
         return np.full(self.task.mesh.n_nodes, self.c_ref)
 
 
-class Sequential(Protocol):
-    """Filter that assimilates one measurement at a time, such as `Filter`."""
-
-    def assimilate(self, voltages: np.ndarray, currents: np.ndarray) -> Any:
-        """Advance one time step and use its measurement vector."""
-
-    def estimate(self, lag: int = 0) -> Estimate:
-        """Return the state ``lag`` steps before the present."""
-
-
 class SequentialEstimator:
     """Estimator that assimilates one measurement at a time, and returns each state with a lag of
     ``task.lag`` time steps; after the last measurement the lag shrinks.
 
-    Subclasses define `assimilate` and `estimate` as in `Sequential`.
+    Subclasses define `assimilate` and `estimate`.
     """
 
     def __init__(self, task: Task) -> None:
@@ -105,14 +95,15 @@ class FilterEstimator(SequentialEstimator):
     ----------
     task : Task
     start : callable
-        ĉ_bh in mol/m³ -> filter at t = 0.
+        ĉ_bh in mol/m³ -> filter at t = 0, with methods as `Filter.assimilate` and
+        `Filter.estimate`.
     """
 
-    def __init__(self, task: Task, start: Callable[[float], Sequential]) -> None:
+    def __init__(self, task: Task, start: Callable[[float], Any]) -> None:
         super().__init__(task)
         self.first = CalibrationFrame(task)
         self._start = start
-        self.filter: Sequential
+        self.filter: Any = None
 
     def assimilate(self, voltages: np.ndarray, currents: np.ndarray) -> None:
         if self.first.complete:

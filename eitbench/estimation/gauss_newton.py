@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import cached_property
+from contextlib import suppress
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -170,22 +170,29 @@ class _NormalEquations:
 
     For sparse P and A with far fewer rows than columns, x = P₀⁻¹g − W (C + V W)⁻¹ Wᵀg with
     P₀ = P + ρ e eᵀ, V = (A; √ρ eᵀ), C = diag(1, …, 1, −1) and W = P₀⁻¹Vᵀ (Woodbury). The unit
-    vector e makes P₀ regular for gradient penalties, whose null space holds the constants. If P₀
-    is singular or the residual is too large, and in all other cases, AᵀA + P is factorised.
+    vector e of the first node makes P₀ regular for gradient penalties, whose null space holds the
+    constants. If P₀ is singular or the residual is too large, and in all other cases, AᵀA + P is
+    factorised.
     """
 
     def __init__(self, penalty: Any) -> None:
         self._penalty = penalty
+        self._grounded = None
+        if sp.issparse(penalty):
+            self._ground = float(penalty.diagonal().max())                             # ρ
+            held = sp.csr_array(([self._ground], ([0], [0])), shape=penalty.shape)
+            with suppress(RuntimeError):                                  # P₀ is singular
+                self._grounded = SparseLU(penalty + held)
 
     def solve(self, A: np.ndarray, g: np.ndarray) -> np.ndarray:
         """Return x (n,) for g (n,)."""
-        if sp.issparse(self._penalty) and 3 * len(A) < len(g) and self._grounded is not None:
+        if 3 * len(A) < len(g) and self._grounded is not None:
             apply = self._by_woodbury(A, self._grounded)
             x = apply(g)
             x += apply(self._residual(A, g, x))              # refinement, because of cancellation
             if np.linalg.norm(self._residual(A, g, x)) <= 1e-10 * np.linalg.norm(g):
                 return x
-        return cho_solve(cho_factor(A.T @ A + self._dense), g)
+        return cho_solve(cho_factor(np.asarray(A.T @ A + self._penalty)), g)
 
     def _residual(self, A: np.ndarray, g: np.ndarray, x: np.ndarray) -> np.ndarray:
         return g - A.T @ (A @ x) - self._penalty @ x
@@ -197,21 +204,3 @@ class _NormalEquations:
         W = grounded.solve(V.T)
         core = lu_factor(V @ W + np.diag(np.append(np.ones(len(A)), -1.0)))
         return lambda g: grounded.solve(g[:, None])[:, 0] - W @ lu_solve(core, W.T @ g)
-
-    @cached_property
-    def _dense(self) -> np.ndarray:
-        return self._penalty.toarray() if sp.issparse(self._penalty) else np.asarray(self._penalty)
-
-    @cached_property
-    def _ground(self) -> float:
-        """ρ."""
-        return float(self._penalty.diagonal().max())
-
-    @cached_property
-    def _grounded(self) -> SparseLU | None:
-        """P₀, with e at the first node; None if it is singular."""
-        held = sp.csr_array(([self._ground], ([0], [0])), shape=self._penalty.shape)
-        try:
-            return SparseLU(self._penalty + held)
-        except RuntimeError:
-            return None

@@ -122,6 +122,11 @@ def stacked(models, observations):
     return [Gaussian(mean[i:i + n], C[i:i + n, i:i + n]) for i in range(n, (T + 1) * n, n)]
 
 
+def assert_close(ours, theirs, tolerance=1e-9):
+    """Compare with a tolerance relative to the largest entry."""
+    np.testing.assert_allclose(ours, theirs, rtol=0, atol=tolerance * np.abs(theirs).max())
+
+
 class QuadraticModel:
     """Substitute for ``ObservationModel``, linear in the currents I: R(c) I = Σ_j c_j² T_j I with symmetric T_j."""
 

@@ -29,6 +29,7 @@ from models import (
     MESH,
     Gaussian,
     LinearGaussian,
+    assert_close,
     by_window,
     coarse_transport,
     dense_filter,
@@ -143,10 +144,6 @@ def measured(filter_, models, m=3, noise=(0.1, 1.0), root=False):
         of_state.append(observation._replace(
             matrix=slope, value=observation.value - offset + slope @ mean[:slope.shape[1]]))
     return seen, of_state
-
-
-def assert_close(ours, theirs, tolerance=1e-9):
-    np.testing.assert_allclose(ours, theirs, rtol=0, atol=tolerance * np.abs(theirs).max())
 
 
 def assert_state(filter_, expected, tolerance=1e-9):

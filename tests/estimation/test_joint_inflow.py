@@ -17,7 +17,7 @@ from eitbench.estimation import (
 )
 from eitbench.worlds.catalogue import PIPE_2D_SKEWED, STATIONARY_TANK_2D
 from eitbench.worlds.task import make_task
-from models import MESH, averages, coarse_transport, directions, shapes, theta_of, two_modes, white_inflow
+from models import MESH, assert_close, averages, coarse_transport, directions, shapes, theta_of, two_modes, white_inflow
 from scipy.linalg import toeplitz
 
 from tiny_worlds import TINY
@@ -55,10 +55,6 @@ def observations(count, seed=5, m=8):
         yield LinearMeasurement(H, LEVEL + 3.0 * random.normal(size=m), np.full(m, 0.1))
 
 
-def near(actual, expected, part):
-    np.testing.assert_allclose(actual, expected, atol=part * np.abs(expected).max(), rtol=0)
-
-
 def stepped(z, steps):
     """Return the concentration after z (steps + W, 2 + 2), the oldest first, from a pipe at c_bh: the first W at the
     nominal velocity, the others at their velocities."""
@@ -81,14 +77,14 @@ def test_concentration_and_derivatives_are_those_of_the_transport():
     for _ in range(steps):
         filter_.predict()
     z = np.concatenate([start[::-1], filter_.mean.reshape(W, 4)[:steps][::-1]])
-    near(filter_.concentration, stepped(z, steps), 1e-10)
+    assert_close(filter_.concentration, stepped(z, steps), 1e-10)
     slope = filter_.space.jacobian(filter_.mean, np.eye(N)).reshape(N, W, 4)
     for k, part in [(0, 0), (3, 1), (6, 0), (0, 2), (0, 3), (1, 2), (3, 2), (3, 3)]:
         change = np.zeros_like(z)
         change[-1 - k, part] = h
         difference = (stepped(z + change, steps) - stepped(z - change, steps)) / (2 * h)
         assert np.abs(difference).max() > 1e-3
-        near(slope[:, k, part], difference, 1e-6)
+        assert_close(slope[:, k, part], difference, 1e-6)
 
 
 def test_a_white_inflow_gives_the_joint_filter():
@@ -108,7 +104,7 @@ def test_a_white_inflow_gives_the_joint_filter():
             found.append([step.innovation, step.innovation_covariance, each.concentration, each.variance,
                           *theta_of(each)])
         for ours, theirs in zip(*found, strict=True):
-            near(ours, theirs, 1e-7)
+            assert_close(ours, theirs, 1e-7)
     assert np.linalg.norm(theta_of(filter_)[0] - belief.initial) > 0.1
 
 
@@ -160,7 +156,7 @@ def test_velocity_priors_of_a_task():
     c = LEVEL + np.random.default_rng(0).normal(size=N)
     for factor in (1.0, 1.2):
         there = told.transport_at(np.array([factor])).step(c, LEVEL, LEVEL)
-        near(there, transport_at([factor * 4.5, 0.0]).step(c, LEVEL, LEVEL), 1e-12)
+        assert_close(there, transport_at([factor * 4.5, 0.0]).step(c, LEVEL, LEVEL), 1e-12)
     assert (told.initial_std, told.walk_std) == (0.3, 0.01)
 
 

@@ -5,7 +5,7 @@ import pytest
 import scipy.linalg
 from eitbench.estimation import LinearMeasurement, kalman_filter
 from eitbench.estimation.reduced import ReducedFilter, ReducedModel, SteadyStates, reduced_model
-from models import LinearGaussian, dense_filter, draw, random_design, random_model
+from models import LinearGaussian, assert_close, dense_filter, draw, random_design, random_model
 
 
 @pytest.fixture
@@ -35,10 +35,6 @@ def run(filter_: ReducedFilter, records: list[list[LinearMeasurement]]):
 def started(model: LinearGaussian, count: int) -> ReducedFilter:
     reduced = ReducedModel(np.eye(14), model.F, model.Q, model.covariance)
     return ReducedFilter(SteadyStates(reduced), count)
-
-
-def assert_close(ours, theirs, tolerance):
-    np.testing.assert_allclose(ours, theirs, rtol=0, atol=tolerance * np.abs(theirs).max())
 
 
 def test_batch_equals_the_textbook(world):
