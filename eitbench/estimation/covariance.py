@@ -225,8 +225,7 @@ def open_loop_arrays(transition: np.ndarray, noise: np.ndarray,
     Parameters
     ----------
     transition : (n, n)
-        F, with spectral radius below one (or F = I without noise, for a stationary target).
-        ``ValueError`` if Π_t has no limit.
+        F, with spectral radius below one. ``ValueError`` if Π_t has no limit.
     noise : (n, n)
         Γ_w.
     initial : (n, n), optional

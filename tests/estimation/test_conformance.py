@@ -63,11 +63,6 @@ def low_rank():
     return model.filter(), [model] * T
 
 
-def dense():
-    models = [random_model(np.random.default_rng(3))] * T
-    return nodal(DenseCovariance(models[0].covariance), models), models
-
-
 def dense_changing():
     models = [random_model(np.random.default_rng(seed)) for seed in range(T)]
     return nodal(DenseCovariance(models[0].covariance), models), models
@@ -123,9 +118,9 @@ def velocity():
     return Filter(space), [model] * T
 
 
-FORMS = [low_rank, dense, dense_changing, dense_by_columns, at_rest, modal, inflow_window, velocity]
+FORMS = [low_rank, dense_changing, dense_by_columns, at_rest, modal, inflow_window, velocity]
 every = pytest.mark.parametrize("form", FORMS)
-nodal_forms = pytest.mark.parametrize("form", [low_rank, dense, dense_changing, dense_by_columns, at_rest])
+nodal_forms = pytest.mark.parametrize("form", [low_rank, dense_changing, dense_by_columns, at_rest])
 
 
 def measured(filter_, models, m=3, noise=(0.1, 1.0), root=False):

@@ -87,22 +87,6 @@ def test_derivatives_of_quadratic_voltages():
     assert 6.0 < off[0] / off[1] < 10.0
 
 
-def test_every_pair_of_electrodes_is_contracted_once(monkeypatch):
-    """Contractions of all 120 pairs are computed once and stay in the cache."""
-    calls = []
-    real = QuadraticVoltageModel._contracted
-    monkeypatch.setattr(QuadraticVoltageModel, "_contracted",
-                        lambda self, currents: calls.append(1) or real(self, currents))
-    task, basis, _ = fast()
-    model = QuadraticVoltageModel(task.observation, task.expected_concentration, basis[:, :4])
-    pairs = np.eye(16)[:, None] - np.eye(16)
-    pairs = pairs[np.triu_indices(16, 1)]
-    c = np.full(task.mesh.n_nodes, task.expected_concentration)
-    first, again = (model.voltages(c, pairs) for _ in range(2))
-    np.testing.assert_array_equal(first, again)
-    assert len(pairs) == len(calls) == 120
-
-
 def test_voltages_of_slugs():
     """For slugs sampled from the prior the error of the voltages is at most half the noise, root mean square."""
     task, _, scaled = fast()

@@ -12,7 +12,6 @@ from eitbench.data.seeds import parse_seeds
 from eitbench.estimation import (
     CalibrationFrame,
     IdentifiedModel,
-    LinearMeasurement,
     compatible_models,
     full_window_filter,
     identify_model,
@@ -24,8 +23,8 @@ from eitbench.estimation import (
 )
 from eitbench.worlds.catalogue import PIPE_2D
 from eitbench.worlds.task import make_task
-from models import by_window, stacked, two_modes, window_law
 from models import tiny_task as task
+from models import two_modes
 
 from tiny_worlds import TINY
 
@@ -154,24 +153,12 @@ def test_only_train_episodes_are_accepted():
         identify_model(examples("train:0-2"), modes=4, residual_only=True)
 
 
-def test_filter_is_gaussian_conditioning():
-    """The filter equals conditioning for three measurement vectors, linear inflows and independent state errors."""
-    filter_ = inflow_filter(task(), replace(prior(), link="linear"), LEVEL, model=model())
-    space, by_x = filter_.space, by_window(filter_.space, LEVEL)
-    random = np.random.default_rng(3)
-    of_state = []
-    for _ in range(3):
-        H = random.normal(size=(3, task().mesh.n_nodes)) / task().mesh.n_nodes
-        value, noise = LEVEL + 0.3 * random.normal(size=3), np.array([0.01, 0.02, 0.1])
-        seen = LinearMeasurement(H, value, noise, LEVEL * H @ model().root)
-        filter_.predict()
-        filter_.update(seen)
-        of_state.append(seen._replace(matrix=H @ by_x, value=value - LEVEL * H.sum(axis=1)))
-    posterior = stacked([window_law(space)] * 3, of_state)[-1]
-    state, k = filter_.estimate(), by_x.shape[1]
-    np.testing.assert_allclose(state.mean, LEVEL + by_x @ posterior.mean[:k], rtol=1e-9)
-    known = ((by_x @ posterior.covariance[:k, :k]) * by_x).sum(axis=1)
-    np.testing.assert_allclose(state.variance, known + ((LEVEL * model().root)**2).sum(axis=1), rtol=1e-7)
+def test_variances_include_the_residual():
+    """The variances of the concentration are those of the inflow and of the residual of the response."""
+    filter_ = inflow_filter(task(), prior(), LEVEL, model=model())
+    of_inflow = inflow_filter(task(), prior(), LEVEL, responses=[model().response])
+    expected = of_inflow.variance + ((LEVEL * model().root)**2).sum(axis=1)
+    np.testing.assert_allclose(filter_.estimate().variance, expected, rtol=1e-9)
 
 
 def test_iteration_is_closer_to_the_most_probable_inflow():

@@ -79,7 +79,7 @@ def test_full_rank_equals_the_full_filter(world):
 
 
 def test_basis_holds_the_largest_reduction(world):
-    """The basis contains more of Σ Z Zᵀ than random subspaces of the same size."""
+    """The basis contains the largest eigenvalues of Σ Z Zᵀ."""
     model, records = world
     learnt, filter_ = 0.0, model.filter()
     for observation in records[0]:
@@ -89,8 +89,4 @@ def test_basis_holds_the_largest_reduction(world):
     basis = reduced_model(model.filter(), np.eye(14), records[0], 5, skip=0).basis
     held = np.trace(basis.T @ learnt @ basis)
     assert held == pytest.approx(np.linalg.eigvalsh(learnt)[-5:].sum(), rel=1e-8)
-    rng = np.random.default_rng(0)
-    for _ in range(20):
-        other = np.linalg.qr(rng.normal(size=(14, 5)))[0]
-        assert np.trace(other.T @ learnt @ other) < held
 

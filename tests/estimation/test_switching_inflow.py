@@ -89,8 +89,8 @@ def test_exact_where_nothing_is_mixed(begins, ends, steps):
 
 
 def test_close_to_enumeration_where_regimes_change():
-    """For 64 sequences the mean agrees to a fifth of the standard deviation, the slug's probability to 0.1; the error of
-    a few particles is smaller."""
+    """For 64 sequences the mean agrees to a fifth of the standard deviation, the slug's probability to 0.1;
+    the error of a few particles is smaller."""
     measured = list(observations(5))
     slug, mean, variance = enumerated(switching(0.1, 0.2), Regimes(0.1, 0.2, 1e-3), measured)
     ours = filtered(switching(0.1, 0.2), measured)
