@@ -33,16 +33,14 @@ from eitbench.estimation.forward import (
 )
 from eitbench.estimation.gauss_newton import (
     StationaryMap,
+    best_homogeneous,
     gauss_newton,
     one_step,
     total_variation,
 )
 from eitbench.estimation.gaussian import LinearMeasurement, condition, innovate
-from eitbench.estimation.homogeneous import best_homogeneous
-from eitbench.estimation.identification import identify_model
-from eitbench.estimation.identified import IdentifiedModel, compatible_models
+from eitbench.estimation.identified import IdentifiedModel, compatible_models, identify_model
 from eitbench.estimation.inflow_estimator import InflowEstimator
-from eitbench.estimation.inflow_map import full_window_filter, map_inflow, maximise_posterior
 from eitbench.estimation.inflow_prior import (
     InflowPrior,
     Regimes,
@@ -56,7 +54,13 @@ from eitbench.estimation.inflow_response import (
     steady_response,
     time_varying_responses,
 )
-from eitbench.estimation.inflow_window import InflowWindow, inflow_filter
+from eitbench.estimation.inflow_window import (
+    InflowWindow,
+    full_window_filter,
+    inflow_filter,
+    map_inflow,
+    maximise_posterior,
+)
 from eitbench.estimation.joint_inflow import VelocityInflowWindow
 from eitbench.estimation.nodal import (
     LogStates,
@@ -74,7 +78,6 @@ from eitbench.estimation.smoother import (
     smooth_means,
     smooth_state,
 )
-from eitbench.estimation.smoothness import smoothness_covariance
 from eitbench.estimation.switching_inflow import ParticleInflowFilter, SwitchingInflowFilter
 from eitbench.estimation.unscented import UnscentedFilter
 from eitbench.estimation.velocity import (
@@ -84,6 +87,7 @@ from eitbench.estimation.velocity import (
     task_velocity_prior,
     velocity_states,
 )
+from eitbench.estimation.walk import smoothness_covariance
 
 __all__ = [
     "BodyTracker", "CalibrationFrame", "DenseCovariance", "EnsembleFilter", "Filter",

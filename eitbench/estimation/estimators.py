@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from eitbench.estimation.homogeneous import best_homogeneous
+from eitbench.estimation.gauss_newton import best_homogeneous
 from eitbench.worlds.task import Estimate, Task
 
 Measurement = tuple[np.ndarray, np.ndarray]

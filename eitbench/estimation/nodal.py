@@ -21,8 +21,7 @@ from eitbench.estimation.covariance import (
 )
 from eitbench.estimation.filter import Filter, StateSpace
 from eitbench.estimation.forward import Forward
-from eitbench.estimation.smoothness import smoothness_covariance
-from eitbench.estimation.walk import RandomWalk
+from eitbench.estimation.walk import RandomWalk, smoothness_covariance
 from eitbench.physics.stationary import StationaryTransport
 
 if TYPE_CHECKING:

@@ -9,7 +9,7 @@ from eitbench.bench.methods import builtin_methods, load_method
 from eitbench.data.episodes import cached_truth_model, simulate
 from eitbench.envs.injection_core import InjectionCore
 from eitbench.estimation.body_particles import SIGNAL_ERROR, BodyParticleFilter, BodyTracker, body_model
-from eitbench.estimation.onboard.body_belief import BodyBelief
+from eitbench.estimation.onboard.belief import BodyBelief
 from eitbench.estimation.onboard.rules import Rules
 from eitbench.worlds import entry
 from eitbench.worlds.bodies import TRANSITION_WIDTH, disc_indicator

@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 from eitbench.estimation import Motion
-from eitbench.estimation.reduced import ReducedFilter
-from eitbench.estimation.reduced_joint import JointStates, TransitionSplines, joint_model
+from eitbench.estimation.reduced import JointStates, ReducedFilter, TransitionSplines, joint_model
 from models import textbook_update
 
 

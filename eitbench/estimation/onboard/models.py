@@ -26,21 +26,24 @@ from eitbench.estimation.onboard.full_filters import VELOCITY_BOUNDS
 from eitbench.estimation.onboard.inflow_states import (
     InflowModel,
     InflowStates,
+    NodeVoltages,
     fit_world_prior,
     inflow_model,
+    node_voltages,
     sample_coordinates,
 )
 from eitbench.estimation.onboard.linearisation import pair_currents
-from eitbench.estimation.onboard.node_voltages import NodeVoltages, node_voltages
 from eitbench.estimation.reduced import (
+    JointModel,
+    JointStates,
     ReducedModel,
     ReducedStates,
     SteadyStates,
     covariance_reduction,
     dominant_directions,
+    joint_model,
     reduced_model,
 )
-from eitbench.estimation.reduced_joint import JointModel, JointStates, joint_model
 from eitbench.numerics.fem import mass_matrix
 from eitbench.worlds.task import make_task
 

@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from eitbench.estimation.onboard.belief import Belief
-from eitbench.estimation.onboard.body_belief import BodyBelief
+from eitbench.estimation.onboard.belief import Belief, BodyBelief
 
 if TYPE_CHECKING:
     from eitbench.estimation.onboard.rules import Rules
