@@ -25,12 +25,6 @@ from eitbench.estimation.estimators import (
     SequentialEstimator,
 )
 from eitbench.estimation.filter import Filter, StateSpace, Step, kalman_filter
-from eitbench.estimation.forward import (
-    LinearisedForwardModel,
-    linearise_at_prediction,
-    linearise_at_reference,
-    linearise_voltages,
-)
 from eitbench.estimation.gauss_newton import (
     StationaryMap,
     best_homogeneous,
@@ -38,7 +32,15 @@ from eitbench.estimation.gauss_newton import (
     one_step,
     total_variation,
 )
-from eitbench.estimation.gaussian import LinearMeasurement, condition, innovate
+from eitbench.estimation.gaussian import (
+    LinearisedForwardModel,
+    LinearMeasurement,
+    condition,
+    innovate,
+    linearise_at_prediction,
+    linearise_at_reference,
+    linearise_voltages,
+)
 from eitbench.estimation.identified import IdentifiedModel, compatible_models, identify_model
 from eitbench.estimation.inflow_estimator import InflowEstimator
 from eitbench.estimation.inflow_prior import (
@@ -61,7 +63,6 @@ from eitbench.estimation.inflow_window import (
     map_inflow,
     maximise_posterior,
 )
-from eitbench.estimation.joint_inflow import VelocityInflowWindow
 from eitbench.estimation.nodal import (
     LogStates,
     Motion,
@@ -81,6 +82,7 @@ from eitbench.estimation.smoother import (
 from eitbench.estimation.switching_inflow import ParticleInflowFilter, SwitchingInflowFilter
 from eitbench.estimation.unscented import UnscentedFilter
 from eitbench.estimation.velocity import (
+    VelocityInflowWindow,
     VelocityPrior,
     VelocityStates,
     scaled_velocity_prior,

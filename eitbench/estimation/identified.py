@@ -19,13 +19,13 @@ from eitbench._files import write_atomically
 from eitbench.data.dataset import Dataset, Example
 from eitbench.data.seeds import SPLITS, format_seed
 from eitbench.estimation.estimators import CalibrationFrame
-from eitbench.estimation.forward import (
+from eitbench.estimation.gaussian import (
     Forward,
     LinearisedForwardModel,
+    LinearMeasurement,
     linearise_at_prediction,
     linearise_at_reference,
 )
-from eitbench.estimation.gaussian import LinearMeasurement
 from eitbench.estimation.inflow_prior import own_world_first
 from eitbench.estimation.inflow_response import ImpulseResponse, steady_response
 from eitbench.worlds.task import Task, make_task

@@ -11,8 +11,8 @@ from scipy.linalg import solve_triangular, toeplitz
 from eitbench.estimation.covariance import Covariance, DenseCovariance
 from eitbench.estimation.estimators import Measurement
 from eitbench.estimation.filter import Filter, StateSpace
-from eitbench.estimation.forward import Forward, linearise_at_prediction
 from eitbench.estimation.gauss_newton import gauss_newton
+from eitbench.estimation.gaussian import Forward, linearise_at_prediction
 from eitbench.estimation.identified import IdentifiedModel
 from eitbench.estimation.inflow_prior import InflowPrior
 from eitbench.estimation.inflow_response import ImpulseResponse, steady_response

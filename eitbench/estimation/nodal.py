@@ -20,7 +20,7 @@ from eitbench.estimation.covariance import (
     open_loop_arrays,
 )
 from eitbench.estimation.filter import Filter, StateSpace
-from eitbench.estimation.forward import Forward
+from eitbench.estimation.gaussian import Forward
 from eitbench.estimation.walk import RandomWalk, smoothness_covariance
 from eitbench.physics.stationary import StationaryTransport
 

@@ -12,8 +12,7 @@ from eitbench._notice import notify
 from eitbench.data.cache import Key, cached, config_dict, model_key
 from eitbench.estimation.covariance import LowRankCovariance, OpenLoopCovariance
 from eitbench.estimation.filter import Filter
-from eitbench.estimation.forward import LinearisedForwardModel
-from eitbench.estimation.gaussian import LinearMeasurement
+from eitbench.estimation.gaussian import LinearisedForwardModel, LinearMeasurement
 from eitbench.estimation.inflow_response import steady_response
 from eitbench.estimation.nodal import (
     FILTER_RANK_TOLERANCE,
