@@ -12,7 +12,6 @@ from eitbench.estimation import (
     LogStates,
     Motion,
     NodalStates,
-    VelocityInflowWindow,
     VelocityPrior,
     VelocityStates,
     fixed_interval_smoother,
@@ -39,7 +38,6 @@ from models import (
     random_model,
     shapes,
     stacked,
-    theta_of,
     two_modes,
     window_law,
 )
@@ -265,21 +263,6 @@ def test_a_window_is_its_own_smoother():
         estimate = filter_.estimate(lag)
         assert_close(estimate.mean, LEVEL + by_x @ posterior.mean[here])
         assert_close(estimate.variance, ((by_x @ posterior.covariance[here, here]) * by_x).sum(axis=1))
-
-
-def test_windows_with_a_known_velocity_are_the_inflow_window():
-    """The difference is at most 1e-3 of the deviation, the truncated part of the response."""
-    task, prior = coarse_task(), two_modes(MESH.points[:7], link="linear")
-    other = Filter(InflowWindow(task, prior, LEVEL))
-    filter_ = Filter(VelocityInflowWindow(task, prior, LEVEL, known_flow(), other.space.window_steps))
-    seen, _ = measured(other, range(4))
-    for each in (filter_, other):
-        run(each, seen)
-    off = np.linalg.norm(filter_.concentration - other.concentration)
-    assert off < 0.02 * np.linalg.norm(other.concentration - LEVEL)
-    theta, variance = theta_of(filter_)
-    np.testing.assert_array_equal(theta, THETA)
-    assert not variance.any()
 
 
 def test_derivatives_of_log_states():

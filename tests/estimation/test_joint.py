@@ -95,14 +95,13 @@ def test_covariance_moves_with_the_derivative_of_the_prediction():
     np.testing.assert_allclose(filter_.covariance.array, expected, atol=1e-7 * np.abs(expected).max())
 
 
-@pytest.mark.parametrize("truth", [[3.2], [4.0, 1.2, 0.4]], ids=["slow", "skew"])
-def test_velocity_is_estimated(truth):
+def test_velocity_is_estimated():
     """For a truth of the filter's model, one to two σ from the prior, θ is within 3σ and the profile within 5 %."""
-    rng, truth = np.random.default_rng(4), np.array(truth)
+    rng, truth = np.random.default_rng(4), np.array([4.0, 1.2, 0.4])
     k, transport = len(truth), transport_at(truth)
     filter_ = joint_filter(k, walk_std=np.zeros(k), nodal_noise=1e-4 * np.eye(N))
     c = transport.step(np.full(N, C_BH), C_BH, C_BH)
-    for _ in range(80):
+    for _ in range(60):
         c = transport.step(c, c[:7], C_BH + C_BH / 4 * rng.normal(size=7))
         H = sensors(rng)
         filter_.predict()
