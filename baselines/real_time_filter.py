@@ -23,6 +23,6 @@ class Estimator(InflowEstimator):
 
 
 @lru_cache(maxsize=2)
-def quadratic(observation, model) -> QuadraticVoltageModel:
+def quadratic(observation, model):
     """Return the quadratic voltage model, computed once for all episodes."""
     return QuadraticVoltageModel(observation, model.c_ref, model.basis)

@@ -87,7 +87,6 @@ from eitbench.estimation.velocity import (
     VelocityStates,
     scaled_velocity_prior,
     task_velocity_prior,
-    velocity_states,
 )
 from eitbench.estimation.walk import smoothness_covariance
 
@@ -109,5 +108,5 @@ __all__ = [
     "maximise_posterior", "modal_states", "network_matches_task", "nodal_filter",
     "nodal_states", "one_step", "reduced_response", "scaled_velocity_prior", "smooth_means",
     "smooth_state", "smoothness_covariance", "steady_response", "task_velocity_prior",
-    "time_varying_responses", "total_variation", "velocity_states",
+    "time_varying_responses", "total_variation",
 ]

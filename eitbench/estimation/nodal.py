@@ -180,7 +180,7 @@ def nodal_states(transport: Transport, prior: Prior, c_ref: float,
         motion = Motion(noise=walk * np.eye(len(mean)) if walk else None)
     else:
         motion = Motion(transport.evolution_model().F,
-                        noise=c_ref**2 * _state_noise(transport, prior))
+                        noise=c_ref**2 * state_noise(transport, prior, prior.inflow_std))
     covariance = c_ref**2 * initial_covariance(transport.mesh, prior)
     return NodalStates(mean, DenseCovariance(covariance), motion)
 
@@ -218,7 +218,7 @@ def flow_motion(task: Task, transition: tuple[np.ndarray, np.ndarray], c_ref: fl
     The nodal part of the noise is small and takes long to compute: the task's flow determines it.
     """
     F, Y = transition
-    noise = task.prior.inflow_std**2 * (Y @ Y.T) + nodal_noise(task.transport, task.prior)
+    noise = task.prior.inflow_std**2 * (Y @ Y.T) + state_noise(task.transport, task.prior)
     return Motion(F, c_ref * Y.sum(axis=1), c_ref**2 * noise)
 
 
@@ -237,7 +237,7 @@ def _open_loop(transport: Transport, prior: Prior) -> OpenLoopCovariance:
         if (seconds := OPEN_LOOP_SECONDS * (len(F) / 1000)**3) > 2.0:
             notify(f"computing the covariance of {len(F)} nodes without measurements, about "
                    f"{seconds:.0f} s; it is cached in {key.path.parent}")
-        return open_loop_arrays(F, _state_noise(transport, prior),
+        return open_loop_arrays(F, state_noise(transport, prior, prior.inflow_std),
                                 initial_covariance(transport.mesh, prior))
 
     known_by = [array_digest(F, Y, transport.mesh.points), config_dict(prior)]
@@ -246,13 +246,6 @@ def _open_loop(transport: Transport, prior: Prior) -> OpenLoopCovariance:
 
 
 @lru_cache(maxsize=4)
-def nodal_noise(transport: Transport, prior: Prior) -> np.ndarray:
-    """Return H Γ_e Hᵀ (n, n) for ĉ_bh = 1."""
-    return transport.evolution_model().state_noise_covariance(0.0, prior.nodal_std**2)
-
-
-@lru_cache(maxsize=4)
-def _state_noise(transport: Transport, prior: Prior) -> np.ndarray:
-    """Return Γ_w (5.16) for ĉ_bh = 1."""
-    model = transport.evolution_model()
-    return model.state_noise_covariance(prior.inflow_std**2, prior.nodal_std**2)
+def state_noise(transport: Transport, prior: Prior, inflow_std: float = 0.0) -> np.ndarray:
+    """Return Γ_w (5.16) for ĉ_bh = 1, by default the part H Γ_e Hᵀ of the nodal noise."""
+    return transport.evolution_model().state_noise_covariance(inflow_std**2, prior.nodal_std**2)

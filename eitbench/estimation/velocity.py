@@ -8,13 +8,14 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
+from scipy.linalg import block_diag
 
 from eitbench import _check
 from eitbench.estimation.covariance import Covariance, DenseCovariance
 from eitbench.estimation.filter import StateSpace
 from eitbench.estimation.inflow_response import one_step_response
 from eitbench.estimation.inflow_window import shift_window, window_model
-from eitbench.estimation.nodal import initial_covariance, nodal_noise
+from eitbench.estimation.nodal import initial_covariance, state_noise
 
 if TYPE_CHECKING:
     from eitbench.estimation.inflow_prior import InflowPrior
@@ -85,35 +86,28 @@ class VelocityStates(StateSpace):
     takes as long to compute as F.
 
     After each measurement vector θ is moved into `VelocityPrior.bounds` by
-    `VelocityPrior.within_bounds`; concentration and covariance do not change. ``ValueError`` names
-    an argument that is out of range, of the wrong shape, or not finite.
+    `VelocityPrior.within_bounds`; concentration and covariance do not change.
 
     Parameters
     ----------
+    task : Task
+        Its prior has the standard deviations relative to ``c_ref`` (Table 5.1); its transport has
+        the nominal velocity.
+    c_ref : float
+        ĉ_bh in mol/m³: mean of the initial concentration and of the inflow.
     flow : VelocityPrior
         Prior of θ.
-    mean, covariance : (n,), (n, n)
-        Mean and covariance of the concentration at t = 0, in mol/m³ and (mol/m³)².
-    inflow, inflow_std : float
-        c_in and the standard deviation of η, both in mol/m³; ĉ_bh, the best homogeneous estimate,
-        and ĉ_bh/4 in the thesis.
-    nodal_noise : (n, n)
-        H Γ_e Hᵀ at the nominal velocity, (mol/m³)².
     """
 
-    def __init__(self, flow: VelocityPrior, mean: np.ndarray, covariance: np.ndarray, *,
-                 inflow: float, inflow_std: float, nodal_noise: np.ndarray) -> None:
+    def __init__(self, task: Task, c_ref: float, flow: VelocityPrior) -> None:
+        self.c_ref = c_ref
         self.flow = flow
-        c = _check.array("mean", mean, (None,), units="mol/m³")
-        n = self._n = len(c)
-        k = len(flow.initial)
-        self._inflow = _check.number("inflow", inflow, units="mol/m³")
-        self._inflow_std = _check.number("inflow_std", inflow_std, low=0.0, units="mol/m³")
-        self._nodal_noise = _check.array("nodal_noise", nodal_noise, (n, n))
-        self._mean = np.concatenate([c, flow.initial])
-        self._covariance = np.zeros((n + k, n + k))
-        self._covariance[:n, :n] = _check.array("covariance", covariance, (n, n))
-        self._covariance[n:, n:] = np.diag(flow.initial_std**2)
+        n = self._n = task.mesh.n_nodes
+        self._inflow_std = task.prior.inflow_std * c_ref
+        self._nodal_noise = c_ref**2 * state_noise(task.transport, task.prior)
+        self._mean = np.concatenate([np.full(n, c_ref), flow.initial])
+        self._covariance = block_diag(c_ref**2 * initial_covariance(task.mesh, task.prior),
+                                      np.diag(flow.initial_std**2))
 
     def initial(self) -> tuple[np.ndarray, Covariance]:
         return self._mean.copy(), DenseCovariance(self._covariance)
@@ -124,7 +118,7 @@ class VelocityStates(StateSpace):
         c, theta = mean[:n], mean[n:]
         transport = self.flow.transport_at(theta)
         inlet = transport.inlet
-        after, by_theta = transport.velocity_derivatives(c, c[inlet], self._inflow,
+        after, by_theta = transport.velocity_derivatives(c, c[inlet], self.c_ref,
                                                          self.flow.basis_fields)
 
         def advance(X: np.ndarray) -> np.ndarray:
@@ -151,20 +145,6 @@ class VelocityStates(StateSpace):
     def velocity(self, mean: np.ndarray,
                  covariance: Covariance) -> tuple[np.ndarray, np.ndarray]:
         return mean[self._n:].copy(), covariance.diagonal()[self._n:]
-
-
-def velocity_states(task: Task, c_ref: float, bounds: tuple[float, float]) -> VelocityStates:
-    """Return the state space of concentration and velocity, with the task's prior of the velocity.
-
-    The initial mean of the concentration and the inflow are ``c_ref`` in mol/m³. Standard
-    deviations are products of ``c_ref`` and the values in Table 5.1; ``bounds`` as in
-    `VelocityPrior`.
-    """
-    prior = task.prior
-    return VelocityStates(task_velocity_prior(task, bounds), np.full(task.mesh.n_nodes, c_ref),
-                          c_ref**2 * initial_covariance(task.mesh, prior), inflow=c_ref,
-                          inflow_std=prior.inflow_std * c_ref,
-                          nodal_noise=c_ref**2 * nodal_noise(task.transport, prior))
 
 
 def task_velocity_prior(task: Task, bounds: tuple[float, float] = (0.05, 4.0)) -> VelocityPrior:

@@ -41,6 +41,7 @@ from models import (
     two_modes,
     window_law,
 )
+from scipy.linalg import block_diag
 
 from tiny_worlds import TINY
 
@@ -105,12 +106,13 @@ def known_flow(k=2):
 
 def velocity():
     """Return a filter with known θ; the state ends with θ."""
-    F, Y = coarse_transport(THETA, 1e-2).transition()
-    n, root = len(F), np.random.default_rng(0).normal(size=(len(F), 20))
-    nodal_noise, P = 0.01 * root @ root.T, 50.0 * np.eye(n)
-    space = VelocityStates(known_flow(), np.full(n, LEVEL), P, inflow=LEVEL, inflow_std=7.0, nodal_noise=nodal_noise)
-    full, Q, covariance = np.eye(n + 2), np.zeros((n + 2, n + 2)), np.zeros((n + 2, n + 2))
-    full[:n, :n], Q[:n, :n], covariance[:n, :n] = F, 49.0 * Y @ Y.T + nodal_noise, P
+    task = coarse_task()
+    F, Y = task.transport.transition()
+    n, none = len(F), np.zeros((2, 2))
+    noise = task.evolution.state_noise_covariance((LEVEL / 4)**2, (LEVEL / 50)**2)
+    space = VelocityStates(task, LEVEL, known_flow())
+    full, Q, covariance = (block_diag(*each) for each in (
+        (F, np.eye(2)), (noise, none), ((LEVEL / 4)**2 * np.eye(n), none)))
     model = LinearGaussian(full, np.concatenate([LEVEL * Y.sum(axis=1), np.zeros(2)]), Q,
                            np.concatenate([np.full(n, LEVEL), THETA]), covariance)
     return Filter(space), [model] * T

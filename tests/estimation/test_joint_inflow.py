@@ -7,6 +7,7 @@ from functools import lru_cache
 import numpy as np
 import pytest
 from eitbench.estimation import (
+    DenseCovariance,
     Filter,
     LinearMeasurement,
     VelocityInflowWindow,
@@ -18,6 +19,7 @@ from eitbench.estimation import (
 from eitbench.worlds.catalogue import PIPE_2D_SKEWED, STATIONARY_TANK_2D
 from eitbench.worlds.task import make_task
 from models import MESH, assert_close, averages, coarse_transport, directions, shapes, theta_of, two_modes, white_inflow
+from scipy.linalg import block_diag
 
 from tiny_worlds import TINY
 
@@ -93,8 +95,10 @@ def test_a_white_inflow_gives_the_joint_filter():
     belief = flow(walk=(0.0, 0.0))
     filter_ = started(belief, 90, white_inflow(task()))
     slope = filter_.space.jacobian(filter_.mean, np.eye(N))
-    joint = Filter(VelocityStates(belief, np.full(N, LEVEL), slope @ filter_.covariance.array @ slope.T, inflow=LEVEL,
-                                  inflow_std=task().prior.inflow_std * LEVEL, nodal_noise=np.zeros((N, N))))
+    quiet = replace(task(), prior=replace(task().prior, nodal_std=0.0))
+    joint = Filter(VelocityStates(quiet, LEVEL, belief))
+    joint.covariance = DenseCovariance(block_diag(slope @ filter_.covariance.array @ slope.T,
+                                                  np.diag(belief.initial_std**2)))
     for observation in observations(10):
         found = []
         for each in (filter_, joint):

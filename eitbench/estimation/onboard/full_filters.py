@@ -14,7 +14,7 @@ from eitbench.estimation.nodal import nodal_states
 from eitbench.estimation.onboard.episode_filters import EpisodeFilters, Innovation
 from eitbench.estimation.onboard.inflow_states import fit_world_prior
 from eitbench.estimation.onboard.linearisation import linearisation_table, std_from_variance
-from eitbench.estimation.velocity import velocity_states
+from eitbench.estimation.velocity import VelocityStates, task_velocity_prior
 
 if TYPE_CHECKING:
     from eitbench.worlds.world import World
@@ -103,4 +103,4 @@ def state_space(world: World, inflow: str) -> StateSpace:
         return InflowWindow(task, fit_world_prior(world), 1.0)
     if task.velocity is None:
         return nodal_states(task.transport, task.prior, 1.0)
-    return velocity_states(task, 1.0, VELOCITY_BOUNDS)
+    return VelocityStates(task, 1.0, task_velocity_prior(task, VELOCITY_BOUNDS))
