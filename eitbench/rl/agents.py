@@ -14,7 +14,6 @@ import numpy as np
 from eitbench._files import write_atomically
 from eitbench.bench.methods import baseline_folder
 from eitbench.envs.injection_core import InjectionCore, flatten_scaled
-from eitbench.estimation.onboard.episode_filters import EpisodeFilters
 from eitbench.estimation.onboard.onboard_filter import filters_class
 from eitbench.estimation.onboard.rules import Rules
 from eitbench.worlds.registry import entry
@@ -41,7 +40,7 @@ class AgentPolicy:
     def __init__(self, rules: Rules, random: np.random.Generator) -> None:
         self.rules = rules
         self.random = random
-        self._filters: EpisodeFilters | None = None
+        self._filters: Any = None
 
     def choose(self, observation: np.ndarray, mask: np.ndarray) -> Any:
         """Return the action for a scaled observation (d,); ``mask`` (n,) bool marks the allowed

@@ -172,7 +172,7 @@ def test_methods_for_stationary_targets_do_not_suit_a_body():
 
 
 def test_estimate_finds_the_body():
-    """In an episode of one pair after another the mean image is darkest at the body."""
+    """The mean image is darkest at the body, for one pair after another."""
     world = entry(ID).world.with_changes({"schedule": {"scored_steps": 24}})
     core = InjectionCore(Rules(world), "reduced")
     seeds = [11]

@@ -154,7 +154,7 @@ def test_only_train_episodes_are_accepted():
 
 
 def test_variances_include_the_residual():
-    """The variances of the concentration are those of the inflow and of the residual of the response."""
+    """The covariance of the response's residual is added to the variances."""
     filter_ = inflow_filter(task(), prior(), LEVEL, model=model())
     of_inflow = inflow_filter(task(), prior(), LEVEL, responses=[model().response])
     expected = of_inflow.variance + ((LEVEL * model().root)**2).sum(axis=1)
