@@ -12,7 +12,7 @@ from eitbench import _check
 from eitbench.data.episode_cache import instrument_faults, integrals, score_mass, scoring_constants
 from eitbench.envs.episodes import EpisodeCore, Observation
 from eitbench.estimation.onboard.episode_filters import BODY, Innovation
-from eitbench.estimation.onboard.onboard_filter import filters_class
+from eitbench.estimation.onboard.full_filters import filters_class
 from eitbench.estimation.onboard.rules import Rules
 from eitbench.worlds.instrument import Faults
 
@@ -63,7 +63,7 @@ class InjectionCore(EpisodeCore):
     ----------
     rules : Rules
     estimator : str
-        One of `eitbench.estimation.onboard.onboard_filter.ESTIMATOR_OPTIONS`.
+        One of `eitbench.estimation.onboard.full_filters.ESTIMATOR_OPTIONS`.
     observation : str
         One of `OBSERVATION_FORMATS`; without an estimator observations are raw.
     """

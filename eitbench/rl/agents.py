@@ -14,7 +14,7 @@ import numpy as np
 from eitbench._files import write_atomically
 from eitbench.bench.methods import baseline_folder
 from eitbench.envs.injection_core import InjectionCore, flatten_scaled
-from eitbench.estimation.onboard.onboard_filter import filters_class
+from eitbench.estimation.onboard.full_filters import filters_class
 from eitbench.estimation.onboard.rules import Rules
 from eitbench.worlds.registry import entry
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from eitbench.estimation.design import pair_design_criteria, symmetric_entries
+from eitbench.estimation.onboard.belief import pair_design_criteria, symmetric_entries
 from eitbench.estimation.onboard.linearisation import electrode_pairs
 from hypothesis import given, settings
 from hypothesis import strategies as st
