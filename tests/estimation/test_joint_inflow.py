@@ -1,5 +1,5 @@
-"""The joint filter of inflow and velocity is compared with the transport, the filter of a known velocity, the joint
-filter with a white inflow, and a simulated truth."""
+"""The joint filter of inflow and velocity is compared with the transport, and with the joint filter of a white
+inflow."""
 
 from dataclasses import replace
 from functools import lru_cache
