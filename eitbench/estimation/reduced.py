@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from itertools import pairwise
 from typing import NamedTuple, Protocol
 
 import numpy as np
@@ -147,12 +146,6 @@ class SteadyStates(ReducedStates):
     def __init__(self, model: ReducedModel) -> None:
         self.model = model
         self.basis = model.basis
-        A = model.transition
-        r = len(A)
-        splits = [k for k in range(1, r) if A[k, k - 1] == 0.0]
-        thirds = {min(splits, key=lambda k: abs(k - third))
-                  for third in (r // 3, 2 * r // 3) if splits}
-        self._edges = [0, *sorted(thirds), r]
 
     def initial(self) -> tuple[np.ndarray, np.ndarray]:
         return np.zeros_like(self.model.initial[0]), self.model.initial
@@ -160,13 +153,9 @@ class SteadyStates(ReducedStates):
     def propagate(self, mean: np.ndarray,
                   covariance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         A = self.model.transition
-        AP, APA = np.empty_like(covariance), np.empty_like(covariance)
-        for begin, end in pairwise(self._edges):              # A is block upper triangular
-            np.matmul(A[begin:end, begin:], covariance[:, begin:], out=AP[:, begin:end])
-        for begin, end in pairwise(self._edges):
-            np.matmul(AP[:, :, begin:], A[begin:end, begin:].T, out=APA[:, :, begin:end])
-        APA += self.model.noise
-        return matvec(A, mean), APA
+        moved = A @ covariance @ A.T
+        moved += self.model.noise
+        return matvec(A, mean), moved
 
     def step(self, mean: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         return self.model.transition, self.model.noise, self.model.transition @ mean
