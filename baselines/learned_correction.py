@@ -7,14 +7,10 @@ of the filter in these modes and its variance. `studies/learn.py` trains the net
 needs numpy and the network file, which only a checkout contains.
 """
 
-from eitbench.estimation import FilterFeatures, InflowEstimator, NetworkCorrectedFilter
+from eitbench.estimation import NetworkEstimator
 
 
-class Estimator(InflowEstimator):
+class Estimator(NetworkEstimator):
     subtracks = ("filter",)
     network_file = "networks/pipe2d-biased.npz"
     parameters = {"network": network_file}  # noqa: RUF012 (as a record has it)
-
-    def start(self, c_ref: float) -> NetworkCorrectedFilter:
-        return NetworkCorrectedFilter(self.network, FilterFeatures(
-            self.task, self.prior, c_ref, self.network["basis"]))

@@ -8,19 +8,15 @@ shrinks, the filter's estimates are not corrected.
 """
 
 from eitbench import Task
-from eitbench.estimation import FilterFeatures, InflowEstimator, NetworkCorrectedFilter
+from eitbench.estimation import NetworkEstimator
 
 LAG = 4
 
 
-class Estimator(InflowEstimator):
+class Estimator(NetworkEstimator):
     subtracks = ("fixed-lag",)
     network_file = "networks/pipe2d-lag.npz"
     parameters = {"network": network_file}  # noqa: RUF012 (as a record has it)
-
-    def start(self, c_ref: float) -> NetworkCorrectedFilter:
-        return NetworkCorrectedFilter(self.network, FilterFeatures(
-            self.task, self.prior, c_ref, self.network["basis"], LAG))
 
     @classmethod
     def suits(cls, task: Task) -> bool:

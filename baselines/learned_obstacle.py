@@ -5,15 +5,11 @@ The network is as in `learned_correction`, the filter as in `identified_flow`. `
 trains it; inference needs numpy and the network file, which only a checkout contains.
 """
 
-from eitbench.estimation import FilterFeatures, InflowEstimator, NetworkCorrectedFilter
+from eitbench.estimation import NetworkEstimator
 
 
-class Estimator(InflowEstimator):
+class Estimator(NetworkEstimator):
     subtracks = ("filter",)
     models = "models"
     network_file = "networks/pipe2d-obstacle.npz"
     parameters = {"network": network_file}  # noqa: RUF012 (as a record has it)
-
-    def start(self, c_ref: float) -> NetworkCorrectedFilter:
-        return NetworkCorrectedFilter(self.network, FilterFeatures(
-            self.task, self.prior, c_ref, self.network["basis"], model=self.model))

@@ -42,7 +42,7 @@ from eitbench.estimation.gaussian import (
     linearise_voltages,
 )
 from eitbench.estimation.identified import IdentifiedModel, compatible_models, identify_model
-from eitbench.estimation.inflow_estimator import InflowEstimator
+from eitbench.estimation.inflow_estimator import InflowEstimator, NetworkEstimator
 from eitbench.estimation.inflow_prior import (
     InflowPrior,
     Regimes,
@@ -95,7 +95,7 @@ __all__ = [
     "FilterEstimator", "FilterFeatures", "FrameEstimator", "IdentifiedModel", "ImpulseResponse",
     "InflowEstimator", "InflowPrior", "InflowWindow", "LinearMeasurement",
     "LinearisedForwardModel", "LogStates",
-    "LowRankCovariance", "Motion", "NetworkCorrectedFilter", "NodalStates",
+    "LowRankCovariance", "Motion", "NetworkCorrectedFilter", "NetworkEstimator", "NodalStates",
     "OpenLoopCovariance", "ParticleInflowFilter", "QuadraticVoltageModel", "RecordSmoother",
     "Regimes", "ScaledVoltageModel", "SequentialEstimator", "StateSpace", "StationaryMap", "Step",
     "SwitchingInflowFilter", "UnscentedFilter", "VelocityInflowWindow", "VelocityPrior",

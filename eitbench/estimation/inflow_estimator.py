@@ -1,4 +1,4 @@
-"""Base class of the built-in methods with a prior of the inflow fitted to training episodes."""
+"""Base classes of the built-in methods with a prior of the inflow fitted to training episodes."""
 
 from __future__ import annotations
 
@@ -6,7 +6,12 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 from eitbench._files import bundled_path
-from eitbench.estimation.correction import load_network, network_matches_task
+from eitbench.estimation.correction import (
+    FilterFeatures,
+    NetworkCorrectedFilter,
+    load_network,
+    network_matches_task,
+)
 from eitbench.estimation.estimators import FilterEstimator
 from eitbench.estimation.identified import IdentifiedModel, compatible_models
 from eitbench.estimation.inflow_prior import InflowPrior, compatible_priors
@@ -60,3 +65,11 @@ class InflowEstimator(FilterEstimator):
                 and (not cls.models or bool(cls._models(task)))
                 and (not cls.network_file
                      or network_matches_task(cls.folder / cls.network_file, task)))
+
+
+class NetworkEstimator(InflowEstimator):
+    """Estimator with a network that corrects the filter of the inflow."""
+
+    def start(self, c_ref: float) -> NetworkCorrectedFilter:
+        return NetworkCorrectedFilter(self.network, FilterFeatures(
+            self.task, self.prior, c_ref, self.network["basis"], self.task.lag, self.model))
