@@ -12,8 +12,6 @@ from eitbench.worlds.task import Estimate, Task
 
 Measurement = tuple[np.ndarray, np.ndarray]
 """Voltages (L,) in V and currents (L,) in A (A/m in 2D) of one injection."""
-Reconstruction = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
-"""Function of the argument ``reconstruct`` of `FrameEstimator`."""
 
 
 class CalibrationFrame:
@@ -161,7 +159,7 @@ class FrameEstimator(SequentialEstimator):
         mol/m³ -> the image (n,) in mol/m³.
     """
 
-    def __init__(self, task: Task, reconstruct: Reconstruction) -> None:
+    def __init__(self, task: Task, reconstruct: Callable[..., np.ndarray]) -> None:
         super().__init__(task)
         self._reconstruct = reconstruct
         self._record: list[Measurement] = []

@@ -310,14 +310,11 @@ def _regressed(moments: RegressionSums, to_modes: np.ndarray,
                ridge: float) -> tuple[np.ndarray, np.ndarray, float]:
     """Return the weights (K·r, q), Σ s lᵀ in modes, and the residual degrees of freedom."""
     cross = moments.cross @ to_modes
-    ridged = moments.inflow + ridge * _mean_square(moments) * np.eye(len(cross))
+    mean_square = np.trace(moments.inflow) / len(cross)
+    ridged = moments.inflow + ridge * mean_square * np.eye(len(cross))
     solved = np.linalg.solve(ridged, np.concatenate([cross, moments.inflow], axis=1))
     q = cross.shape[1]
     return solved[:, :q], cross, float(moments.states - np.trace(solved[:, q:]))
-
-
-def _mean_square(moments: RegressionSums) -> float:
-    return float(np.trace(moments.inflow) / len(moments.inflow))
 
 
 def _ridge(parts: list[RegressionSums], to_modes: np.ndarray) -> float:
@@ -327,14 +324,11 @@ def _ridge(parts: list[RegressionSums], to_modes: np.ndarray) -> float:
     losses = np.zeros(len(CV_RIDGES))
     for part in parts:
         others = _together(each for each in parts if each is not part)
-        values, directions = np.linalg.eigh(others.inflow)
-        theirs = directions.T @ others.cross @ to_modes
-        ours = directions.T @ part.cross @ to_modes
-        inflow = directions.T @ part.inflow @ directions
+        cross = part.cross @ to_modes
         for k, ridge in enumerate(CV_RIDGES):
-            weights = theirs / (values + ridge * _mean_square(others))[:, None]
+            weights, *_ = _regressed(others, to_modes, ridge)
             # squared error of the part, up to a constant
-            losses[k] += (weights * (inflow @ weights)).sum() - 2.0 * (ours * weights).sum()
+            losses[k] += (weights * (part.inflow @ weights - 2.0 * cross)).sum()
     return float(CV_RIDGES[losses.argmin()])
 
 
@@ -348,8 +342,12 @@ def _across(world: World, seeds: Iterable[int]) -> np.ndarray:
 def _moments(example: Example, world: World, task: Task, across: np.ndarray, known: np.ndarray,
              linearised: bool) -> RegressionSums:
     """Return the sums over an episode, minus the response ``known`` (n, K·r) to past inflows."""
-    s = inflow_regressors(world.sample_inflow(example.seed) / world.background - 1.0, across,
-                          len(example.truth), known.shape[1] // across.shape[1])
+    r = across.shape[1]
+    K = known.shape[1] // r
+    inflow = (world.sample_inflow(example.seed) / world.background - 1.0) @ across
+    inflow = np.concatenate([np.zeros((K, r)), inflow])             # zero before the first inflow
+    newest = len(inflow) - len(example.truth) + np.arange(len(example.truth))
+    s = inflow[newest[:, None] - np.arange(K)].reshape(-1, K * r)
     d = example.truth / world.background - 1.0
     l = d - s @ known.T
     steps, errors = _errors(task, example, linearised)
@@ -378,13 +376,3 @@ def _errors(task: Task, example: Example, linearised: bool) -> tuple[np.ndarray,
     computed = np.array([task.observation.voltages(truth[t], example.currents[t:t + 1])[0]
                          for t in steps])
     return steps, (example.voltages[steps] - computed) / task.noise.std(computed)
-
-
-def inflow_regressors(s: np.ndarray, across: np.ndarray, steps: int, memory: int) -> np.ndarray:
-    """Return the K last inflows in modes, (T, K·r), for each of the last T states; deviations
-    before the first inflow of ``s`` (·, n_inlet) are zero."""
-    reduced = s @ across
-    longer = np.concatenate([np.zeros((memory, reduced.shape[1])), reduced])
-    newest = len(longer) - steps + np.arange(steps)
-    past = longer[newest[:, None] - np.arange(memory)]
-    return past.reshape(steps, -1)
