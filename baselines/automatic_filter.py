@@ -18,6 +18,7 @@ from eitbench.estimation import (
     RecordSmoother,
     SwitchingInflowFilter,
     VelocityInflowWindow,
+    VelocityStates,
     compatible_models,
     compatible_priors,
     inflow_filter,
@@ -27,7 +28,6 @@ from eitbench.estimation import (
     nodal_states,
     scaled_velocity_prior,
     task_velocity_prior,
-    velocity_states,
 )
 from eitbench.estimation.inflow_prior import nominal_worlds, source_world
 from eitbench.estimation.walk import RandomWalk
@@ -74,7 +74,7 @@ def choose(task: Task, c_ref: float, prior, model):
         states = nodal_states(task.transport, task.prior, c_ref)
         return Filter(states, linearise_at_reference(task, c_ref))
     if prior is None:
-        return Filter(velocity_states(task, c_ref, BOUNDS), extended)
+        return Filter(VelocityStates(task, c_ref, task_velocity_prior(task, BOUNDS)), extended)
     if task.velocity is not None:
         flow = task_velocity_prior(task, BOUNDS)
         return Filter(VelocityInflowWindow(task, prior, c_ref, flow, WINDOW), extended)

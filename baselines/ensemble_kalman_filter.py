@@ -5,22 +5,17 @@ The inflow's logarithm has a coloured Gaussian prior fitted to training episodes
 the task specifies is assumed to be exact.
 """
 
-from pathlib import Path
-
 import numpy as np
 
 from eitbench import Task
 from eitbench.estimation import (
     EnsembleFilter,
-    FilterEstimator,
-    compatible_priors,
+    InflowEstimator,
     linearise_at_prediction,
     scaled_velocity_prior,
     task_velocity_prior,
 )
 
-PRIORS = Path(__file__).with_name("priors")
-LINK = "logarithm"
 MEMBERS = 256
 SPIN_UP_STEPS = 30
 """Spin-up: time steps until the members' inflows fill the pipe."""
@@ -30,20 +25,19 @@ SEED = 0
 """Random seed of the ensemble, the same in every episode."""
 
 
-class Estimator(FilterEstimator):
+class Estimator(InflowEstimator):
     subtracks = ("filter",)
     parameters = {  # noqa: RUF012 (as a record has it)
         "members": MEMBERS, "lead_in": SPIN_UP_STEPS, "bounds": list(BOUNDS), "seed": SEED}
 
-    def __init__(self, task: Task) -> None:
-        prior = compatible_priors(PRIORS, task, LINK)[0]
+    def start(self, c_ref: float) -> EnsembleFilter:
+        task = self.task
         flow = (scaled_velocity_prior(task, 0.0, 0.0) if task.velocity is None
                 else task_velocity_prior(task, BOUNDS))
-        super().__init__(task, lambda c_ref: EnsembleFilter(
-            task, prior, c_ref, flow, MEMBERS, SPIN_UP_STEPS, np.random.default_rng(SEED),
-            linearise_at_prediction(task)))
+        return EnsembleFilter(task, self.prior, c_ref, flow, MEMBERS, SPIN_UP_STEPS,
+                              np.random.default_rng(SEED), linearise_at_prediction(task))
 
-    @staticmethod
-    def suits(task: Task) -> bool:
+    @classmethod
+    def suits(cls, task: Task) -> bool:
         # a 3D inlet has too many modes for an ensemble of this size
-        return task.mesh.dim == 2 and bool(compatible_priors(PRIORS, task, LINK))
+        return task.mesh.dim == 2 and bool(cls.priors(task))

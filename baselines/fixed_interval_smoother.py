@@ -7,7 +7,7 @@ from eitbench.estimation import (
     LinearisedForwardModel,
     RecordSmoother,
     fixed_interval_smoother,
-    table_5_1_filter,
+    nodal_filter,
 )
 
 
@@ -17,10 +17,15 @@ class Estimator(FilterEstimator):
     def __init__(self, task: Task) -> None:
         super().__init__(task, lambda c_ref: start(task, c_ref))
 
+    @staticmethod
+    def suits(task: Task) -> bool:
+        """Return True for a pipe: a closed vessel has no covariance of low rank."""
+        return len(task.transport.inlet) > 0
+
 
 def start(task: Task, c_ref: float) -> RecordSmoother:
     """Return the smoother for a best homogeneous estimate in mol/m³."""
-    filter_ = table_5_1_filter(task.transport, task.prior, c_ref)
+    filter_ = nodal_filter(task.transport, task.prior, c_ref)
     linear = LinearisedForwardModel(task.observation, task.noise, filter_.mean)
     return RecordSmoother(lambda record: fixed_interval_smoother(
         filter_, [linear(*measurement) for measurement in record]))

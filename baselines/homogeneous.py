@@ -4,24 +4,25 @@ of every leaderboard."""
 import numpy as np
 
 from eitbench import Estimate, Task
-from eitbench.estimation import best_homogeneous
+from eitbench.estimation import SequentialEstimator, best_homogeneous
 
 
-class Estimator:
+class Estimator(SequentialEstimator):
     subtracks = ("filter", "fixed-lag", "smoothing")
     role = "floor"
 
     def __init__(self, task: Task) -> None:
-        self.task = task
+        super().__init__(task)
         self.record: list[tuple[np.ndarray, np.ndarray]] = []
         self.c_bh = task.expected_concentration
 
-    def update(self, voltages: np.ndarray, currents: np.ndarray) -> Estimate:
+    def assimilate(self, voltages: np.ndarray, currents: np.ndarray) -> None:
         task = self.task
-        n = task.mesh.n_nodes
-        if len(self.record) < task.n_steps:
-            self.record.append((voltages, currents))
-            if len(self.record) % len(task.currents) == 0 or len(self.record) == task.n_steps:
-                V, I = (np.array(part) for part in zip(*self.record, strict=True))
-                self.c_bh = best_homogeneous(task.observation, task.noise, n, V, I, self.c_bh)
-        return Estimate(np.full(n, self.c_bh))
+        self.record.append((voltages, currents))
+        if self.measured % len(task.currents) == 0 or self.measured == task.n_steps:
+            V, I = (np.array(part) for part in zip(*self.record, strict=True))
+            self.c_bh = best_homogeneous(task.observation, task.noise, task.mesh.n_nodes, V, I,
+                                         self.c_bh)
+
+    def estimate(self, lag: int = 0) -> Estimate:
+        return Estimate(np.full(self.task.mesh.n_nodes, self.c_bh))

@@ -5,7 +5,13 @@ between 0.05 and 4 times its prior mean, to exclude backflow and divergence of t
 """
 
 from eitbench import Task
-from eitbench.estimation import Filter, FilterEstimator, linearise_at_prediction, velocity_states
+from eitbench.estimation import (
+    Filter,
+    FilterEstimator,
+    VelocityStates,
+    linearise_at_prediction,
+    task_velocity_prior,
+)
 
 BOUNDS = (0.05, 4.0)
 
@@ -16,7 +22,8 @@ class Estimator(FilterEstimator):
 
     def __init__(self, task: Task) -> None:
         super().__init__(task, lambda c_ref: Filter(
-            velocity_states(task, c_ref, BOUNDS), linearise_at_prediction(task)))
+            VelocityStates(task, c_ref, task_velocity_prior(task, BOUNDS)),
+            linearise_at_prediction(task)))
 
     @staticmethod
     def suits(task: Task) -> bool:

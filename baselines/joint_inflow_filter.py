@@ -4,21 +4,16 @@ inflow's logarithm, with a coloured Gaussian prior fitted to training episodes.
 A velocity that the task specifies is scaled by an unknown factor.
 """
 
-from pathlib import Path
-
 from eitbench import Task
 from eitbench.estimation import (
     Filter,
-    FilterEstimator,
+    InflowEstimator,
     VelocityInflowWindow,
-    compatible_priors,
     linearise_at_prediction,
     scaled_velocity_prior,
     task_velocity_prior,
 )
 
-PRIORS = Path(__file__).with_name("priors")
-LINK = "logarithm"
 WINDOW = 30
 """Number of past inflows in the state; the mean residence time is 18 steps."""
 BOUNDS = (0.05, 4.0)
@@ -28,20 +23,20 @@ FACTOR_WALK = 0.0
 """Standard deviations of the initial factor and of its steps."""
 
 
-class Estimator(FilterEstimator):
+class Estimator(InflowEstimator):
     subtracks = ("filter",)
     parameters = {  # noqa: RUF012 (as a record has it)
         "window": WINDOW, "bounds": list(BOUNDS), "factor_std": VELOCITY_FACTOR_STD,
         "factor_walk": FACTOR_WALK}
 
-    def __init__(self, task: Task) -> None:
-        prior = compatible_priors(PRIORS, task, LINK)[0]
+    def start(self, c_ref: float) -> Filter:
+        task = self.task
         flow = (scaled_velocity_prior(task, VELOCITY_FACTOR_STD, FACTOR_WALK)
                 if task.velocity is None else task_velocity_prior(task, BOUNDS))
-        super().__init__(task, lambda c_ref: Filter(
-            VelocityInflowWindow(task, prior, c_ref, flow, WINDOW), linearise_at_prediction(task)))
+        return Filter(VelocityInflowWindow(task, self.prior, c_ref, flow, WINDOW),
+                      linearise_at_prediction(task))
 
-    @staticmethod
-    def suits(task: Task) -> bool:
+    @classmethod
+    def suits(cls, task: Task) -> bool:
         # a 3D inlet has four times the nodes, and all their contributions are propagated
-        return task.mesh.dim == 2 and bool(compatible_priors(PRIORS, task, LINK))
+        return task.mesh.dim == 2 and bool(cls.priors(task))

@@ -7,34 +7,10 @@ of the filter in these modes and its variance. `studies/learn.py` trains the net
 needs numpy and the network file, which only a checkout contains.
 """
 
-from pathlib import Path
-
-from eitbench import Task
-from eitbench.estimation import (
-    FilterEstimator,
-    FilterFeatures,
-    NetworkCorrectedFilter,
-    compatible_priors,
-    load_network,
-    network_matches_task,
-)
-
-BASELINE_DIR = Path(__file__).parent
-NETWORK = "networks/pipe2d-biased.npz"
+from eitbench.estimation import NetworkEstimator
 
 
-class Estimator(FilterEstimator):
+class Estimator(NetworkEstimator):
     subtracks = ("filter",)
-    parameters = {"network": NETWORK}  # noqa: RUF012 (as a record has it)
-
-    def __init__(self, task: Task) -> None:
-        network = load_network(BASELINE_DIR / NETWORK)
-        prior = compatible_priors(BASELINE_DIR / "priors", task, "logarithm")[0]
-        super().__init__(task, lambda c_ref: NetworkCorrectedFilter(
-            network, FilterFeatures(task, prior, c_ref, network["basis"])))
-
-    @staticmethod
-    def suits(task: Task) -> bool:
-        """Return True for tasks with the vessel, injections and flow model of the training."""
-        known_inlet = bool(compatible_priors(BASELINE_DIR / "priors", task, "logarithm"))
-        return known_inlet and network_matches_task(BASELINE_DIR / NETWORK, task)
+    network_file = "networks/pipe2d-biased.npz"
+    parameters = {"network": network_file}  # noqa: RUF012 (as a record has it)

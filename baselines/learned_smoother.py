@@ -8,60 +8,49 @@ contains.
 """
 
 from collections.abc import Iterator
-from pathlib import Path
 
 import numpy as np
 
 from eitbench import Estimate, Task
 from eitbench.estimation import (
-    FilterEstimator,
     FilterFeatures,
+    InflowEstimator,
     RecordSmoother,
     apply_correction,
-    compatible_priors,
     gru_step,
     initial_hidden_state,
-    load_network,
-    network_matches_task,
 )
 
-BASELINE_DIR = Path(__file__).parent
-NETWORK = "networks/pipe2d-smoothing.npz"
 LAG = 20
 """Time steps after which measurements hardly change the estimate of a state."""
 
 
-class Estimator(FilterEstimator):
+class Estimator(InflowEstimator):
     subtracks = ("smoothing",)
-    parameters = {"network": NETWORK, "lag": LAG}  # noqa: RUF012 (as a record has it)
+    network_file = "networks/pipe2d-smoothing.npz"
+    parameters = {"network": network_file, "lag": LAG}  # noqa: RUF012 (as a record has it)
 
-    def __init__(self, task: Task) -> None:
-        super().__init__(task, lambda c_ref: RecordSmoother(
-            lambda record: self.corrected(c_ref, record)))
-        self.network = load_network(BASELINE_DIR / NETWORK)
+    @classmethod
+    def suits(cls, task: Task) -> bool:
+        return task.n_steps > LAG and super().suits(task)
 
-    @staticmethod
-    def suits(task: Task) -> bool:
-        """Return True for tasks with the vessel, injections and flow model of the training."""
-        known_inlet = bool(compatible_priors(BASELINE_DIR / "priors", task, "logarithm"))
-        long_enough = task.n_steps > LAG
-        return long_enough and known_inlet and network_matches_task(BASELINE_DIR / NETWORK, task)
+    def start(self, c_ref: float) -> RecordSmoother:
+        return RecordSmoother(lambda record: self.corrected(c_ref, record))
 
     def corrected(self, c_ref: float, record) -> list[Estimate]:
         """Return the corrected states of a whole measurement sequence."""
-        prior = compatible_priors(BASELINE_DIR / "priors", self.task, "logarithm")[0]
-        see = FilterFeatures(self.task, prior, c_ref, self.network["basis"], LAG)
-        seen, (reduced,) = see.record(record, LAG)
+        features = FilterFeatures(self.task, self.prior, c_ref, self.network["basis"], LAG)
+        seen, (reduced,) = features.record(record, LAG)
         inputs = np.concatenate([seen, reduced], axis=1)
-        forward = list(self.memories(inputs, ""))
-        backward = list(self.memories(inputs[::-1], "backward_"))
-        memories = np.concatenate([forward, backward[::-1]], axis=1)
+        forward = list(self.hidden_states(inputs, ""))
+        backward = list(self.hidden_states(inputs[::-1], "backward_"))
+        hidden_states = np.concatenate([forward, backward[::-1]], axis=1)
         return [apply_correction(self.network, c_ref, *each)
-                for each in zip(reduced, inputs, memories, strict=True)]
+                for each in zip(reduced, inputs, hidden_states, strict=True)]
 
-    def memories(self, inputs: np.ndarray, way: str) -> Iterator[np.ndarray]:
+    def hidden_states(self, inputs: np.ndarray, direction: str) -> Iterator[np.ndarray]:
         """Yield the hidden state (h,) of each step."""
-        memory = initial_hidden_state(self.network)
-        for seen in inputs:
-            memory = gru_step(self.network, seen, memory, way)
-            yield memory
+        state = initial_hidden_state(self.network)
+        for each in inputs:
+            state = gru_step(self.network, each, state, direction)
+            yield state

@@ -2,20 +2,11 @@
 slug, with an extended Kalman filter; `switching_inflow_filter` mixes the regimes at each step.
 """
 
-from pathlib import Path
-
 import numpy as np
 
 from eitbench import Task
-from eitbench.estimation import (
-    FilterEstimator,
-    ParticleInflowFilter,
-    compatible_priors,
-    linearise_at_prediction,
-)
+from eitbench.estimation import InflowEstimator, ParticleInflowFilter, linearise_at_prediction
 
-PRIORS = Path(__file__).with_name("priors")
-LINK = "logarithm"
 LEVEL_STD = 0.05
 """Standard deviation of the inflow between slugs, relative to the best homogeneous estimate."""
 PARTICLES = 8
@@ -23,17 +14,15 @@ PARTICLES = 8
 SEED = 0
 
 
-class Estimator(FilterEstimator):
+class Estimator(InflowEstimator):
     subtracks = ("filter",)
     parameters = {"level_std": LEVEL_STD, "particles": PARTICLES, "seed": SEED}  # noqa: RUF012
 
-    def __init__(self, task: Task) -> None:
-        prior = compatible_priors(PRIORS, task, LINK)[0]
-        super().__init__(task, lambda c_ref: ParticleInflowFilter(
-            task, prior, c_ref, LEVEL_STD, linearise_at_prediction(task), PARTICLES,
-            np.random.default_rng(SEED)))
+    def start(self, c_ref: float) -> ParticleInflowFilter:
+        return ParticleInflowFilter(
+            self.task, self.prior, c_ref, LEVEL_STD, linearise_at_prediction(self.task), PARTICLES,
+            np.random.default_rng(SEED))
 
-    @staticmethod
-    def suits(task: Task) -> bool:
-        priors = compatible_priors(PRIORS, task, LINK)
-        return task.velocity is None and bool(priors) and priors[0].regimes is not None
+    @classmethod
+    def suits(cls, task: Task) -> bool:
+        return super().suits(task) and cls.priors(task)[0].regimes is not None

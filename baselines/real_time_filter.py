@@ -6,39 +6,23 @@ A step takes less than the 5 ms between two injections, on one core.
 
 from dataclasses import replace
 from functools import lru_cache
-from pathlib import Path
 
 from eitbench import Task
-from eitbench.estimation import (
-    FilterEstimator,
-    IdentifiedModel,
-    QuadraticVoltageModel,
-    compatible_models,
-    compatible_priors,
-    inflow_filter,
-)
-
-BASELINE_DIR = Path(__file__).parent
+from eitbench.estimation import Filter, InflowEstimator, QuadraticVoltageModel, inflow_filter
 
 
-class Estimator(FilterEstimator):
+class Estimator(InflowEstimator):
     subtracks = ("filter",)
+    models = "models"
 
-    def __init__(self, task: Task) -> None:
-        prior = compatible_priors(BASELINE_DIR / "priors", task, "logarithm")[0]
-        model = compatible_models(BASELINE_DIR / "models", task)[0]
-        task = replace(task, observation=quadratic(task.observation, model))
-        super().__init__(
-            task, lambda c_ref: inflow_filter(task, prior, c_ref, model=model))
+    def prepare(self, task: Task) -> Task:
+        return replace(task, observation=quadratic(task.observation, self.model))
 
-    @staticmethod
-    def suits(task: Task) -> bool:
-        known_inlet = bool(compatible_priors(BASELINE_DIR / "priors", task, "logarithm"))
-        known_flow = bool(compatible_models(BASELINE_DIR / "models", task))
-        return task.velocity is None and known_inlet and known_flow
+    def start(self, c_ref: float) -> Filter:
+        return inflow_filter(self.task, self.prior, c_ref, model=self.model)
 
 
 @lru_cache(maxsize=2)
-def quadratic(observation, model: IdentifiedModel):
+def quadratic(observation, model):
     """Return the quadratic voltage model, computed once for all episodes."""
     return QuadraticVoltageModel(observation, model.c_ref, model.basis)

@@ -14,14 +14,12 @@ from eitbench import Task
 from eitbench.estimation import (
     DenseCovariance,
     Filter,
-    FilterEstimator,
+    InflowEstimator,
     InflowWindow,
-    compatible_priors,
     linearise_at_prediction,
 )
 
-BASELINE_DIR = Path(__file__).parent
-MODEL = BASELINE_DIR / "models" / "turbulent" / "pipe2dturbulent.npz"
+MODEL = Path(__file__).parent / "models" / "turbulent" / "pipe2dturbulent.npz"
 
 
 class FlowErrorWindow(InflowWindow):
@@ -63,15 +61,14 @@ class FlowErrorWindow(InflowWindow):
         return (both @ (slope @ covariance.array[:k, :k] @ slope.T) * both).sum(axis=1)
 
 
-class Estimator(FilterEstimator):
+class Estimator(InflowEstimator):
     subtracks = ("filter",)
 
-    def __init__(self, task: Task) -> None:
-        prior = compatible_priors(BASELINE_DIR / "priors", task, "logarithm")[0]
-        super().__init__(task, lambda c_ref: Filter(
-            FlowErrorWindow(task, prior, c_ref), linearise_at_prediction(task)))
+    def start(self, c_ref: float) -> Filter:
+        return Filter(FlowErrorWindow(self.task, self.prior, c_ref),
+                      linearise_at_prediction(self.task))
 
-    @staticmethod
-    def suits(task: Task) -> bool:
+    @classmethod
+    def suits(cls, task: Task) -> bool:
         """Return True in the world whose errors were fitted."""
         return task.world == "Pipe2DTurbulent" and not task.lag

@@ -12,7 +12,7 @@ from eitbench.estimation import (
     LinearisedForwardModel,
     LinearMeasurement,
     Motion,
-    table_5_1_filter,
+    nodal_filter,
 )
 from eitbench.numerics.mesh import rectangle_mesh
 from eitbench.physics.observation import ObservationModel
@@ -48,7 +48,7 @@ def problem(cells: tuple[int, int], steps: int = WARM_UP + STEPS) -> Problem:
     transport, seen = pipe_model(cells)
     level = PIPE_2D.expected_concentration
     evolution = transport.evolution_model()
-    start = table_5_1_filter(transport, PIPE_2D.prior, level, rank_tolerance=1e-6)
+    start = nodal_filter(transport, PIPE_2D.prior, level, rank_tolerance=1e-6)
     rng = np.random.default_rng(0)
     inflow = PIPE_2D.target.draw_inflow(PIPE_2D, rng)
     at_inlet = transport.mesh.points[transport.inlet]

@@ -22,7 +22,7 @@ from eitbench.estimation import (
     Motion,
     NodalStates,
     kalman_filter,
-    table_5_1_filter,
+    nodal_filter,
 )
 from eitbench.scoring import relative_error
 
@@ -40,7 +40,7 @@ def main() -> None:
     for k in range(first.length):
         first.add(voltages[k], currents[k])
     start = time.perf_counter()
-    initial = table_5_1_filter(task.transport, task.prior, first.c_ref)
+    initial = nodal_filter(task.transport, task.prior, first.c_ref)
     print(f"n = {task.mesh.n_nodes}, {task.currents.shape[1]} measurements per injection; "
           "evolution model and open-loop covariance, once per process: "
           f"{time.perf_counter() - start:.0f} s")
@@ -72,7 +72,7 @@ def main() -> None:
     print("|---|---|---|---|---|---|")
     row("full, n × n", steps, seconds, n)
     for tolerance in TOLERANCES:
-        filter_ = table_5_1_filter(task.transport, task.prior, first.c_ref,
+        filter_ = nodal_filter(task.transport, task.prior, first.c_ref,
                                    rank_tolerance=tolerance)
         start = time.perf_counter()
         steps = kalman_filter(filter_, observations)

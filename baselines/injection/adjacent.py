@@ -1,20 +1,9 @@
 """Adjacent pairs: round-robin over neighbouring electrodes; a budget is used at equal intervals."""
 
-from itertools import cycle
-from typing import Any
-
-import numpy as np
-
-from eitbench.estimation.onboard.rules import Rules
+from eitbench.estimation.onboard.policies import CyclePolicy
 
 
-class Policy:
-    def __init__(self, rules: Rules, random: np.random.Generator) -> None:
-        self.rules = rules
-        L = rules.world.currents.shape[1]
-        numbers = {frozenset(pair): k for k, pair in enumerate(rules.pairs.tolist())}
-        self.cycle = cycle(numbers[frozenset((i, (i + 1) % L))] for i in range(L))
-
-    def act(self, observation: dict[str, np.ndarray]) -> Any:
-        now = self.rules.is_injection_step(observation["left"])
-        return self.rules.action(next(self.cycle) if now else None)
+class Policy(CyclePolicy):
+    def electrodes(self) -> list[tuple[int, int]]:
+        L = self.rules.world.currents.shape[1]
+        return [(i, (i + 1) % L) for i in range(L)]

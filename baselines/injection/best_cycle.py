@@ -4,18 +4,16 @@ at equal intervals.
 For a body in a tank a pair that rotates around the tank is better.
 """
 
-from itertools import cycle
 from typing import Any
 
-import numpy as np
-
+from eitbench.estimation.onboard.policies import CyclePolicy
 from eitbench.estimation.onboard.rules import Rules
 
 ROTATION = [sorted((5 * k % 16, (5 * k + 3) % 16)) for k in range(16)]
 """Three electrodes apart, and five further in each step."""
 
 
-class Policy:
+class Policy(CyclePolicy):
     # Found by `python studies/search_injections.py`; electrodes by world.
     parameters: dict[str, Any] = {  # noqa: RUF012
         "cycle": {"Pipe2D": [[0, 8]], "Pipe2D with faults": [[8, 11], [0, 4], [2, 8], [0, 14]],
@@ -33,11 +31,5 @@ class Policy:
         found = cls.parameters["cycle"].get(rules.tuning_key, [None])
         return all(pair in pairs for pair in found)
 
-    def __init__(self, rules: Rules, random: np.random.Generator) -> None:
-        pairs = rules.pairs.tolist()
-        self.rules = rules
-        self.cycle = cycle(pairs.index(pair) for pair in self.parameters["cycle"][rules.tuning_key])
-
-    def act(self, observation: dict[str, np.ndarray]) -> Any:
-        now = self.rules.is_injection_step(observation["left"])
-        return self.rules.action(next(self.cycle) if now else None)
+    def electrodes(self) -> list[list[int]]:
+        return self.parameters["cycle"][self.rules.tuning_key]

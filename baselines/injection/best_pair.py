@@ -3,12 +3,11 @@ budget is used at equal intervals."""
 
 from typing import Any
 
-import numpy as np
-
+from eitbench.estimation.onboard.policies import CyclePolicy
 from eitbench.estimation.onboard.rules import Rules
 
 
-class Policy:
+class Policy(CyclePolicy):
     # Found by `python studies/search_injections.py`; electrodes by world.
     parameters: dict[str, Any] = {  # noqa: RUF012
         "pair": {"Pipe2D": [0, 8], "Pipe2D with faults": [0, 8],
@@ -24,10 +23,5 @@ class Policy:
     def suits(cls, rules: Rules) -> bool:
         return cls.parameters["pair"].get(rules.tuning_key) in rules.pairs.tolist()
 
-    def __init__(self, rules: Rules, random: np.random.Generator) -> None:
-        self.rules = rules
-        self.pair = rules.pairs.tolist().index(self.parameters["pair"][rules.tuning_key])
-
-    def act(self, observation: dict[str, np.ndarray]) -> Any:
-        injects = self.rules.is_injection_step(observation["left"])
-        return self.rules.action(self.pair if injects else None)
+    def electrodes(self) -> list[list[int]]:
+        return [self.parameters["pair"][self.rules.tuning_key]]

@@ -7,11 +7,11 @@ from typing import Any
 
 import numpy as np
 
-from eitbench.estimation.onboard.belief import Belief
+from eitbench.estimation.onboard.policies import BeliefPolicy
 from eitbench.estimation.onboard.rules import Rules
 
 
-class Policy:
+class Policy(BeliefPolicy):
     parameters: dict[str, Any] = {  # noqa: RUF012
         "alarm": 0.7, "calm": 1.0, "stretch": 1.2, "quick": 2, "slowest": 8}
 
@@ -20,13 +20,11 @@ class Policy:
         return rules.budget is not None
 
     def __init__(self, rules: Rules, random: np.random.Generator) -> None:
-        self.rules = rules
-        self.belief: Belief | None = None
+        super().__init__(rules, random)
         self.waited = 0
         self.alarmed = False
 
-    def act(self, observation: dict[str, np.ndarray]) -> Any:
-        self.belief = Belief.create_or_update(self.belief, self.rules, observation)
+    def injects(self, observation: dict[str, np.ndarray]) -> bool:
         if observation["currents"].any():
             self.waited = 0
             # In predicted standard deviations: 0.4 to 0.6 without a slug, since the model assumes
@@ -37,12 +35,13 @@ class Policy:
         self.waited += 1
         steps, injections = observation["left"]
         if injections == 0.0:
-            return self.rules.action(None)
+            return False
         reserve = steps / self.parameters["slowest"]
         interval = self.parameters["stretch"] * steps / injections
         if self.alarmed and injections > reserve:
             interval = self.parameters["quick"]
-        if self.waited < min(interval, steps):
-            return self.rules.action(None)
+        return self.waited >= min(interval, steps)
+
+    def pair(self, observation: dict[str, np.ndarray]) -> int:
         criterion = self.belief.design_criteria(self.belief.predict_covariance())[0]
-        return self.rules.action(int(criterion.argmax()))
+        return int(criterion.argmax())

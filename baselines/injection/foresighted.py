@@ -12,26 +12,24 @@ from typing import Any
 import numpy as np
 
 from eitbench.estimation.onboard.belief import Belief
+from eitbench.estimation.onboard.policies import BeliefPolicy
 from eitbench.estimation.onboard.rules import Rules
 
 
-class Policy:
+class Policy(BeliefPolicy):
     # The best of a few values on the episodes train:0-11 of Pipe2DInjectionFlow.
     parameters: dict[str, Any] = {"steps": 4, "rest": 20}  # noqa: RUF012
 
     suits = staticmethod(Belief.suits)
 
     def __init__(self, rules: Rules, random: np.random.Generator) -> None:
-        self.rules = rules
-        self.belief: Belief | None = None
+        super().__init__(rules, random)
         known = rules.world.velocity_model is None
         self.rest = 0 if known else min(self.parameters["rest"], len(rules.pairs) // 2)
         self.recent: list[int] = []
 
-    def act(self, observation: dict[str, np.ndarray]) -> Any:
-        self.belief = belief = Belief.create_or_update(self.belief, self.rules, observation)
-        if not self.rules.is_injection_step(observation["left"]):
-            return self.rules.action(None)
+    def pair(self, observation: dict[str, np.ndarray]) -> int:
+        belief = self.belief
         # The next measurement is one step ahead; errors after the episode's end are not scored.
         steps = min(self.parameters["steps"], int(observation["left"][0]) - 1)
         criterion = belief.design_criteria(belief.predict_covariance(),
@@ -39,4 +37,4 @@ class Policy:
         criterion[self.recent] = -np.inf
         pair = int(criterion.argmax())
         self.recent = [*self.recent, pair][-self.rest:] if self.rest else []
-        return self.rules.action(pair)
+        return pair

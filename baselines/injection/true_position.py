@@ -5,17 +5,15 @@ It measures the value of the position for the choice of the injections: the poli
 it, the filter only to the voltages.
 """
 
-from typing import Any
-
 import numpy as np
 
 from eitbench.envs.injection_core import InjectionCore
-from eitbench.estimation.onboard.belief import BodyBelief
+from eitbench.estimation.onboard.policies import BeliefPolicy
 from eitbench.estimation.onboard.rules import Rules
 from eitbench.worlds.random_streams import episode_streams
 
 
-class Policy:
+class Policy(BeliefPolicy):
     privileged = True
     role = "reference"
 
@@ -24,14 +22,12 @@ class Policy:
         return rules.tracks_body
 
     def __init__(self, rules: Rules, random: np.random.Generator, core: InjectionCore) -> None:
-        self.rules = rules
+        super().__init__(rules, random)
         self.core = core
-        self.belief: BodyBelief | None = None
         streams = episode_streams(core.seeds[0])
         self.path = rules.world.target.path(rules.world, streams.flow)
 
-    def act(self, observation: dict[str, np.ndarray]) -> Any:
-        self.belief = belief = BodyBelief.create_or_update(self.belief, self.rules, observation)
+    def pair(self, observation: dict[str, np.ndarray]) -> int:
         t = self.core.t + 1
         centre = self.path.centres[t] if self.path.present[t] else None
-        return self.rules.action(int(belief.criteria(centre)[0].argmax()))
+        return int(self.belief.criteria(centre)[0].argmax())

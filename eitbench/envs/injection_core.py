@@ -12,7 +12,7 @@ from eitbench import _check
 from eitbench.data.episode_cache import instrument_faults, integrals, score_mass, scoring_constants
 from eitbench.envs.episodes import EpisodeCore, Observation
 from eitbench.estimation.onboard.episode_filters import BODY, Innovation
-from eitbench.estimation.onboard.onboard_filter import OnboardFilter, filters_class
+from eitbench.estimation.onboard.full_filters import filters_class
 from eitbench.estimation.onboard.rules import Rules
 from eitbench.worlds.instrument import Faults
 
@@ -63,7 +63,7 @@ class InjectionCore(EpisodeCore):
     ----------
     rules : Rules
     estimator : str
-        One of `eitbench.estimation.onboard.onboard_filter.ESTIMATOR_OPTIONS`.
+        One of `eitbench.estimation.onboard.full_filters.ESTIMATOR_OPTIONS`.
     observation : str
         One of `OBSERVATION_FORMATS`; without an estimator observations are raw.
     """
@@ -146,8 +146,7 @@ class InjectionCore(EpisodeCore):
             return
         self._frames = np.stack([self._measure(k, np.repeat(cycle[None], B, axis=0))
                                  for k, cycle in enumerate(world.currents)], axis=1)
-        self._onboard = OnboardFilter(self._filters_type, self.rules, self._frames)
-        self._filters = self._onboard.filters
+        self._filters = self._filters_type(self.rules, self._frames)
         self._voltages = self._frames[:, -1].copy()
         self.currents = np.repeat(world.currents[-1:], B, axis=0)
         for k in range(N_RECENT_CURRENTS):
@@ -214,7 +213,7 @@ class InjectionCore(EpisodeCore):
         self.t += 1
         if not self._filters_type:
             return np.zeros(len(currents))
-        self._onboard.assimilate(self._voltages, currents)
+        self._filters.assimilate(self._voltages, currents)
         if self.t <= self.world.warm_up:
             return np.zeros(len(currents))
         rewards = self.homogeneous_errors()[:, self.t - 1] - self.errors()
@@ -275,7 +274,7 @@ class InjectionCore(EpisodeCore):
         shown = {"voltages": np.nan_to_num(self._voltages), "currents": self.currents.copy()}
         if self._filters_type:
             shown |= {"recent": self._recent.copy(), "frame": np.nan_to_num(self._frames)}
-            shown |= self._onboard.features()
+            shown |= self._filters.features()
         left = [np.full(len(self.n_injections), float(self.world.n_steps - self.t))]
         if self.rules.budget is not None:
             left.append(self.rules.budget - self.n_injections.astype(float))

@@ -22,25 +22,27 @@ from eitbench.estimation.estimators import (
     FilterEstimator,
     FrameEstimator,
     RecordSmoother,
+    SequentialEstimator,
 )
 from eitbench.estimation.filter import Filter, StateSpace, Step, kalman_filter
-from eitbench.estimation.forward import (
-    LinearisedForwardModel,
-    linearise_at_prediction,
-    linearise_at_reference,
-    linearise_voltages,
-)
 from eitbench.estimation.gauss_newton import (
     StationaryMap,
+    best_homogeneous,
     gauss_newton,
     one_step,
     total_variation,
 )
-from eitbench.estimation.gaussian import LinearMeasurement, condition, innovate
-from eitbench.estimation.homogeneous import best_homogeneous
-from eitbench.estimation.identification import identify_model
-from eitbench.estimation.identified import IdentifiedModel, compatible_models
-from eitbench.estimation.inflow_map import full_window_filter, map_inflow, maximise_posterior
+from eitbench.estimation.gaussian import (
+    LinearisedForwardModel,
+    LinearMeasurement,
+    condition,
+    innovate,
+    linearise_at_prediction,
+    linearise_at_reference,
+    linearise_voltages,
+)
+from eitbench.estimation.identified import IdentifiedModel, compatible_models, identify_model
+from eitbench.estimation.inflow_estimator import InflowEstimator, NetworkEstimator
 from eitbench.estimation.inflow_prior import (
     InflowPrior,
     Regimes,
@@ -54,8 +56,13 @@ from eitbench.estimation.inflow_response import (
     steady_response,
     time_varying_responses,
 )
-from eitbench.estimation.inflow_window import InflowWindow, inflow_filter
-from eitbench.estimation.joint_inflow import VelocityInflowWindow
+from eitbench.estimation.inflow_window import (
+    InflowWindow,
+    full_window_filter,
+    inflow_filter,
+    map_inflow,
+    maximise_posterior,
+)
 from eitbench.estimation.nodal import (
     LogStates,
     Motion,
@@ -65,7 +72,6 @@ from eitbench.estimation.nodal import (
     modal_states,
     nodal_filter,
     nodal_states,
-    table_5_1_filter,
 )
 from eitbench.estimation.quadratic_voltages import QuadraticVoltageModel, ScaledVoltageModel
 from eitbench.estimation.smoother import (
@@ -73,24 +79,25 @@ from eitbench.estimation.smoother import (
     smooth_means,
     smooth_state,
 )
-from eitbench.estimation.smoothness import smoothness_covariance
 from eitbench.estimation.switching_inflow import ParticleInflowFilter, SwitchingInflowFilter
 from eitbench.estimation.unscented import UnscentedFilter
 from eitbench.estimation.velocity import (
+    VelocityInflowWindow,
     VelocityPrior,
     VelocityStates,
     scaled_velocity_prior,
     task_velocity_prior,
-    velocity_states,
 )
+from eitbench.estimation.walk import smoothness_covariance
 
 __all__ = [
     "BodyTracker", "CalibrationFrame", "DenseCovariance", "EnsembleFilter", "Filter",
     "FilterEstimator", "FilterFeatures", "FrameEstimator", "IdentifiedModel", "ImpulseResponse",
-    "InflowPrior", "InflowWindow", "LinearMeasurement", "LinearisedForwardModel", "LogStates",
-    "LowRankCovariance", "Motion", "NetworkCorrectedFilter", "NodalStates",
+    "InflowEstimator", "InflowPrior", "InflowWindow", "LinearMeasurement",
+    "LinearisedForwardModel", "LogStates",
+    "LowRankCovariance", "Motion", "NetworkCorrectedFilter", "NetworkEstimator", "NodalStates",
     "OpenLoopCovariance", "ParticleInflowFilter", "QuadraticVoltageModel", "RecordSmoother",
-    "Regimes", "ScaledVoltageModel", "StateSpace", "StationaryMap", "Step",
+    "Regimes", "ScaledVoltageModel", "SequentialEstimator", "StateSpace", "StationaryMap", "Step",
     "SwitchingInflowFilter", "UnscentedFilter", "VelocityInflowWindow", "VelocityPrior",
     "VelocityStates", "VoltageFeatures", "apply_correction", "best_homogeneous",
     "compatible_models", "compatible_priors", "condition", "fit_inflow_prior",
@@ -100,6 +107,6 @@ __all__ = [
     "linearise_at_reference", "linearise_voltages", "load_network", "map_inflow",
     "maximise_posterior", "modal_states", "network_matches_task", "nodal_filter",
     "nodal_states", "one_step", "reduced_response", "scaled_velocity_prior", "smooth_means",
-    "smooth_state", "smoothness_covariance", "steady_response", "table_5_1_filter",
-    "task_velocity_prior", "time_varying_responses", "total_variation", "velocity_states",
+    "smooth_state", "smoothness_covariance", "steady_response", "task_velocity_prior",
+    "time_varying_responses", "total_variation",
 ]

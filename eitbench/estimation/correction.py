@@ -62,19 +62,6 @@ def gru_step(network: Network, inputs: np.ndarray, hidden_state: np.ndarray,
     return (1.0 - keep) * np.tanh(seen_new + reset * kept_new) + keep * hidden_state
 
 
-def network_output(network: Network, inputs: np.ndarray,
-                   hidden_state: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the correction (q,) and its variance (q,): a linear map of the hidden state (of both
-    directions), plus linear maps of the inputs (d,) with weights from the hidden state."""
-    inputs = inputs / network["input_scale"]
-    told = network["output_weight"] @ hidden_state + network["output_bias"]
-    correction, log_variance = np.split(told, 2)
-    mixed = network["mixing_weight"] @ hidden_state + network["mixing_bias"]
-    correction = correction + mixed @ (network["maps"] @ inputs)
-    scale = network["output_scale"]
-    return scale * correction, scale**2 * np.exp(log_variance)
-
-
 def initial_hidden_state(network: Network) -> np.ndarray:
     """Return the hidden state (h,) before the first input."""
     return np.zeros(network["hidden_weight"].shape[1])
@@ -82,12 +69,20 @@ def initial_hidden_state(network: Network) -> np.ndarray:
 
 def apply_correction(network: Network, c_ref: float, reduced: np.ndarray, inputs: np.ndarray,
                      hidden_state: np.ndarray) -> Estimate:
-    """Return ĉ_bh (1 + B (a + Δ)) and its variance, for the modes a = ``reduced`` (q,)."""
+    """Return ĉ_bh (1 + B (a + Δ)) and its variance, for the modes a = ``reduced`` (q,).
+
+    Δ is a linear map of the hidden state (of both directions), plus linear maps of the inputs (d,)
+    with weights from the hidden state.
+    """
+    outputs = network["output_weight"] @ hidden_state + network["output_bias"]
+    linear, log_variance = np.split(outputs, 2)
+    mixing = network["mixing_weight"] @ hidden_state + network["mixing_bias"]
+    scale = network["output_scale"]
+    correction = scale * (linear + mixing @ (network["maps"] @ (inputs / network["input_scale"])))
     basis = network["basis"]
-    correction, variance = network_output(network, inputs, hidden_state)
     mean = 1.0 + basis @ (reduced + correction)
-    spread = basis**2 @ variance + network["rest"]
-    return Estimate(c_ref * mean, c_ref**2 * spread)
+    variance = basis**2 @ (scale**2 * np.exp(log_variance)) + network["rest"]
+    return Estimate(c_ref * mean, c_ref**2 * variance)
 
 
 def _sigmoid(x: np.ndarray) -> np.ndarray:

@@ -15,8 +15,6 @@ from eitbench import _check
 
 _BLOCK = 128
 """Number of columns copied at once when a triangle is mirrored; a block fits the CPU cache."""
-_PANEL = 64
-"""Number of columns passed to a callable transition at once; a panel fits the CPU cache."""
 
 COMPRESSED_FROM = 8
 """Time of the first compression of the transient; before, its rank has hardly decreased."""
@@ -88,7 +86,8 @@ class DenseCovariance(Covariance):
 
     def propagate(self, transition: Transition | None, noise: np.ndarray | None = None) -> Self:
         if callable(transition):
-            self._transform_by_columns(transition)
+            self._array[:] = transition(transition(self._array).T)         # F (F P)ᵀ
+            _mirror(self._array)
         elif transition is not None:
             self._transform(transition)
         if noise is not None:
@@ -137,16 +136,6 @@ class DenseCovariance(Covariance):
         blas.dtrmm(1.0, P.T, B.T, lower=1, trans_a=1, overwrite_b=1)
         blas.dsyr2k(1.0, np.asfortranarray(F.T), B.T, beta=0.0, c=P.T, trans=1, lower=1,
                     overwrite_c=1)
-        _mirror(P)
-
-    def _transform_by_columns(self, apply: Callable[[np.ndarray], np.ndarray]) -> None:
-        """P ← F P Fᵀ as F (F P)ᵀ; only the upper triangle is used."""
-        P, B = self._array, self._work
-        panels = [slice(begin, begin + _PANEL) for begin in range(0, len(P), _PANEL)]
-        for panel in panels:
-            B[:, panel] = apply(P[:, panel])
-        for panel in panels:
-            P[:panel.stop, panel] = apply(B[panel].T)[:panel.stop]
         _mirror(P)
 
 
@@ -225,8 +214,7 @@ def open_loop_arrays(transition: np.ndarray, noise: np.ndarray,
     Parameters
     ----------
     transition : (n, n)
-        F, with spectral radius below one (or F = I without noise, for a stationary target).
-        ``ValueError`` if Π_t has no limit.
+        F, with spectral radius below one. ``ValueError`` if Π_t has no limit.
     noise : (n, n)
         Γ_w.
     initial : (n, n), optional

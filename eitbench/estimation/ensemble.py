@@ -7,8 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from eitbench import _check
-from eitbench.estimation.forward import Forward
-from eitbench.estimation.gaussian import LinearMeasurement
+from eitbench.estimation.gaussian import Forward, LinearMeasurement
 from eitbench.estimation.inflow_window import yule_walker
 from eitbench.worlds.task import Estimate
 

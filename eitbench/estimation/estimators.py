@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
-from eitbench.estimation.homogeneous import best_homogeneous
+from eitbench.estimation.gauss_newton import best_homogeneous
 from eitbench.worlds.task import Estimate, Task
 
 Measurement = tuple[np.ndarray, np.ndarray]
 """Voltages (L,) in V and currents (L,) in A (A/m in 2D) of one injection."""
-Reconstruction = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
-"""Function of the argument ``reconstruct`` of `FrameEstimator`."""
 
 
 class CalibrationFrame:
@@ -50,36 +48,26 @@ class CalibrationFrame:
         return np.full(self.task.mesh.n_nodes, self.c_ref)
 
 
-class Sequential(Protocol):
-    """Filter that assimilates one measurement at a time, such as `Filter`."""
+class SequentialEstimator:
+    """Estimator that assimilates one measurement at a time, and returns each state with a lag of
+    ``task.lag`` time steps; after the last measurement the lag shrinks.
 
-    def assimilate(self, voltages: np.ndarray, currents: np.ndarray) -> Any:
-        """Advance one time step and use its measurement vector."""
-
-    def estimate(self, lag: int = 0) -> Estimate:
-        """Return the state ``lag`` steps before the present."""
-
-
-class FilterEstimator:
-    """Estimator that returns each state of a filter with a lag of ``task.lag`` time steps.
-
-    During the calibration frame it returns the homogeneous estimate; then the filter starts from
-    t = 0 and assimilates the frame. After the last measurement the lag shrinks.
-
-    Parameters
-    ----------
-    task : Task
-    start : callable
-        ĉ_bh in mol/m³ -> filter at t = 0.
+    Subclasses define `assimilate` and `estimate`.
     """
 
-    def __init__(self, task: Task, start: Callable[[float], Sequential]) -> None:
+    def __init__(self, task: Task) -> None:
         self.task = task
-        self.first = CalibrationFrame(task)
-        self._start = start
-        self.filter: Sequential
-        self._measured = 0
+        self.measured = 0
+        """number of assimilated measurements"""
         self._requested = -task.lag
+
+    def assimilate(self, voltages: np.ndarray, currents: np.ndarray) -> None:
+        """Use a measurement vector, (L,) in V and in A (A/m in 2D)."""
+        raise NotImplementedError
+
+    def estimate(self, lag: int = 0) -> Estimate:
+        """Return the state ``lag`` steps before the last measurement."""
+        raise NotImplementedError
 
     def update(self, voltages: np.ndarray, currents: np.ndarray) -> Estimate | None:
         """Return the state t − lag after measurement t, (L,) V and A each; None before the first.
@@ -87,21 +75,46 @@ class FilterEstimator:
         After the last measurement the arguments are ignored.
         """
         self._requested += 1
-        if self._measured == self.task.n_steps:
-            return self._estimate()._replace(innovation=None, innovation_covariance=None)
-        self._measured += 1
+        if self.measured == self.task.n_steps:
+            estimate = self.estimate(self.measured - self._requested)
+            return estimate._replace(innovation=None, innovation_covariance=None)
+        self.measured += 1
+        self.assimilate(voltages, currents)
+        return self.estimate(self.measured - self._requested) if self._requested > 0 else None
+
+
+class FilterEstimator(SequentialEstimator):
+    """Estimator that returns the states of a filter.
+
+    During the calibration frame it returns the homogeneous estimate; then the filter starts from
+    t = 0 and assimilates the frame.
+
+    Parameters
+    ----------
+    task : Task
+    start : callable
+        ĉ_bh in mol/m³ -> filter at t = 0, with methods as `Filter.assimilate` and
+        `Filter.estimate`.
+    """
+
+    def __init__(self, task: Task, start: Callable[[float], Any]) -> None:
+        super().__init__(task)
+        self.first = CalibrationFrame(task)
+        self._start = start
+        self.filter: Any = None
+
+    def assimilate(self, voltages: np.ndarray, currents: np.ndarray) -> None:
         if self.first.complete:
             self.filter.assimilate(voltages, currents)
         elif self.first.add(voltages, currents):
             self.filter = self._start(self.first.c_ref)
             for measurement in self.first.measurements:
                 self.filter.assimilate(*measurement)
-        elif self._requested > 0:
-            return Estimate(self.first.mean)
-        return self._estimate() if self._requested > 0 else None
 
-    def _estimate(self) -> Estimate:
-        estimate = self.filter.estimate(self._measured - self._requested)
+    def estimate(self, lag: int = 0) -> Estimate:
+        if not self.first.complete:
+            return Estimate(self.first.mean)
+        estimate = self.filter.estimate(lag)
         if self.task.velocity is None:
             return estimate._replace(velocity=None, velocity_variance=None)
         return estimate
@@ -132,7 +145,7 @@ class RecordSmoother:
         return self._estimates[-1 - lag]
 
 
-class FrameEstimator:
+class FrameEstimator(SequentialEstimator):
     """Estimator that reconstructs a frame of measurements at a time, as of a stationary target.
 
     In filtering the frame consists of the latest measurements; with a lag each state gets the image
@@ -146,30 +159,30 @@ class FrameEstimator:
         mol/m³ -> the image (n,) in mol/m³.
     """
 
-    def __init__(self, task: Task, reconstruct: Reconstruction) -> None:
-        self.task = task
+    def __init__(self, task: Task, reconstruct: Callable[..., np.ndarray]) -> None:
+        super().__init__(task)
         self._reconstruct = reconstruct
         self._record: list[Measurement] = []
         self._images: dict[int, np.ndarray] = {}
-        self._requested = -task.lag
 
-    def update(self, voltages: np.ndarray, currents: np.ndarray) -> Estimate | None:
-        """Return the image of the state t − lag after measurement t, (L,) V and A each."""
+    def assimilate(self, voltages: np.ndarray, currents: np.ndarray) -> None:
+        self._record.append((voltages, currents))
+
+    def estimate(self, lag: int = 0) -> Estimate:
         task = self.task
-        self._requested += 1
-        if len(self._record) < task.n_steps:
-            self._record.append((voltages, currents))
-        if self._requested < 1:
-            return None
-        frame = len(task.currents)
-        end = len(self._record)
-        if task.lag > 0:
-            end = min(-(-self._requested // frame) * frame, task.n_steps)
+        end = self.frame_end(len(self._record) - lag)
         if end not in self._images:
-            V, I = (np.array(part)
-                    for part in zip(*self._record[max(0, end - frame):end], strict=True))
+            begin = max(0, end - len(task.currents))
+            V, I = (np.array(part) for part in zip(*self._record[begin:end], strict=True))
             n = task.mesh.n_nodes
             c_bh = best_homogeneous(task.observation, task.noise, n, V, I,
                                     task.expected_concentration)
             self._images = {end: self._reconstruct(V, I, np.full(n, c_bh))}
         return Estimate(self._images[end])
+
+    def frame_end(self, state: int) -> int:
+        """Return the number of the last measurement of the frame for a state t = 1, 2, …"""
+        if self.task.lag == 0:
+            return len(self._record)
+        frame = len(self.task.currents)
+        return min(-(-state // frame) * frame, self.task.n_steps)

@@ -9,8 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from eitbench.estimation.covariance import Covariance
-from eitbench.estimation.forward import Forward
-from eitbench.estimation.gaussian import LinearMeasurement, condition, innovate
+from eitbench.estimation.gaussian import Forward, LinearMeasurement, condition, innovate
 from eitbench.worlds.task import Estimate
 
 

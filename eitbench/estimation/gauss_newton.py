@@ -1,9 +1,10 @@
-"""Gauss–Newton method, and reconstruction of a stationary target (thesis 5.11)."""
+"""Gauss–Newton method, reconstruction of a stationary target (thesis 5.11), and best homogeneous
+estimate."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import cached_property
+from contextlib import suppress
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -16,7 +17,7 @@ from eitbench.worlds.task import Estimate
 
 if TYPE_CHECKING:
     from eitbench.numerics.mesh import Mesh
-    from eitbench.physics.observation import VoltageModel
+    from eitbench.physics.observation import VoltageModel, VoltageNoise
     from eitbench.worlds.task import Task
 
 
@@ -170,22 +171,29 @@ class _NormalEquations:
 
     For sparse P and A with far fewer rows than columns, x = P₀⁻¹g − W (C + V W)⁻¹ Wᵀg with
     P₀ = P + ρ e eᵀ, V = (A; √ρ eᵀ), C = diag(1, …, 1, −1) and W = P₀⁻¹Vᵀ (Woodbury). The unit
-    vector e makes P₀ regular for gradient penalties, whose null space holds the constants. If P₀
-    is singular or the residual is too large, and in all other cases, AᵀA + P is factorised.
+    vector e of the first node makes P₀ regular for gradient penalties, whose null space holds the
+    constants. If P₀ is singular or the residual is too large, and in all other cases, AᵀA + P is
+    factorised.
     """
 
     def __init__(self, penalty: Any) -> None:
         self._penalty = penalty
+        self._grounded = None
+        if sp.issparse(penalty):
+            self._ground = float(penalty.diagonal().max())                             # ρ
+            held = sp.csr_array(([self._ground], ([0], [0])), shape=penalty.shape)
+            with suppress(RuntimeError):                                  # P₀ is singular
+                self._grounded = SparseLU(penalty + held)
 
     def solve(self, A: np.ndarray, g: np.ndarray) -> np.ndarray:
         """Return x (n,) for g (n,)."""
-        if sp.issparse(self._penalty) and 3 * len(A) < len(g) and self._grounded is not None:
+        if 3 * len(A) < len(g) and self._grounded is not None:
             apply = self._by_woodbury(A, self._grounded)
             x = apply(g)
             x += apply(self._residual(A, g, x))              # refinement, because of cancellation
             if np.linalg.norm(self._residual(A, g, x)) <= 1e-10 * np.linalg.norm(g):
                 return x
-        return cho_solve(cho_factor(A.T @ A + self._dense), g)
+        return cho_solve(cho_factor(np.asarray(A.T @ A + self._penalty)), g)
 
     def _residual(self, A: np.ndarray, g: np.ndarray, x: np.ndarray) -> np.ndarray:
         return g - A.T @ (A @ x) - self._penalty @ x
@@ -198,20 +206,39 @@ class _NormalEquations:
         core = lu_factor(V @ W + np.diag(np.append(np.ones(len(A)), -1.0)))
         return lambda g: grounded.solve(g[:, None])[:, 0] - W @ lu_solve(core, W.T @ g)
 
-    @cached_property
-    def _dense(self) -> np.ndarray:
-        return self._penalty.toarray() if sp.issparse(self._penalty) else np.asarray(self._penalty)
 
-    @cached_property
-    def _ground(self) -> float:
-        """ρ."""
-        return float(self._penalty.diagonal().max())
+def best_homogeneous(model: VoltageModel, noise: VoltageNoise, n: int, voltages: np.ndarray,
+                     currents: np.ndarray, start: float, *, tolerance: float = 1e-8,
+                     max_iterations: int = 30) -> float:
+    """Return ĉ_bh = argmin_c Σ ((V − U(c·1))/std)², by Gauss–Newton in ln c (docs/methods.md, 3).
 
-    @cached_property
-    def _grounded(self) -> SparseLU | None:
-        """P₀, with e at the first node; None if it is singular."""
-        held = sp.csr_array(([self._ground], ([0], [0])), shape=self._penalty.shape)
-        try:
-            return SparseLU(self._penalty + held)
-        except RuntimeError:
-            return None
+    Steps in ln c keep c positive. ``RuntimeError`` if the iteration does not converge.
+
+    Parameters
+    ----------
+    model : VoltageModel
+    noise
+        Noise model with a method ``std(voltages)``, evaluated at the measured voltages.
+    n : int
+        Number of nodes.
+    voltages, currents : (K, L)
+        Measurements in V, NaN where missing, and injections in A (A/m in 2D).
+    start : float
+        Initial guess in mol/m³, > 0.
+    """
+    # Injections repeat: U(c·1) is computed once for each distinct pattern.
+    patterns, which = np.unique(currents, axis=0, return_inverse=True)
+    which = which.reshape(-1)
+    weight = np.isfinite(voltages) / noise.std(np.nan_to_num(voltages))
+    voltages = np.nan_to_num(voltages)
+    c = float(start)
+    for _ in range(max_iterations):
+        computed, jacobian = model.linearise(np.full(n, c), patterns)
+        residual = (voltages - computed[which]) * weight
+        slope = c * jacobian.sum(axis=2)[which] * weight
+        change = float(np.clip((slope * residual).sum() / (slope**2).sum(), -1.0, 1.0))
+        c *= float(np.exp(change))
+        if abs(change) < tolerance:
+            return c
+    raise RuntimeError(f"best homogeneous estimate did not converge in {max_iterations} "
+                       f"iterations; last change {change:g}, last value {c:g} mol/m³")

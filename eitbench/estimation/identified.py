@@ -5,23 +5,31 @@ from __future__ import annotations
 
 import io
 import json
-from collections.abc import Mapping
-from dataclasses import dataclass, field
-from functools import cached_property, lru_cache
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, replace
+from functools import cached_property, lru_cache, reduce
+from operator import add
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from eitbench import _check
 from eitbench._files import write_atomically
-from eitbench.estimation.forward import Forward, linearise_at_prediction, linearise_at_reference
-from eitbench.estimation.gaussian import LinearMeasurement
+from eitbench.data.dataset import Dataset, Example
+from eitbench.data.seeds import SPLITS, format_seed
+from eitbench.estimation.estimators import CalibrationFrame
+from eitbench.estimation.gaussian import (
+    Forward,
+    LinearisedForwardModel,
+    LinearMeasurement,
+    linearise_at_prediction,
+    linearise_at_reference,
+)
 from eitbench.estimation.inflow_prior import own_world_first
-from eitbench.estimation.inflow_response import ImpulseResponse
-
-if TYPE_CHECKING:
-    from eitbench.worlds.task import Task
+from eitbench.estimation.inflow_response import ImpulseResponse, steady_response
+from eitbench.worlds.task import Task, make_task
+from eitbench.worlds.world import World
 
 FILE_KEYS = {"basis": "basis", "impulse_response": "weights", "inlet_modes": "across",
              "residual_covariance": "spread", "current_patterns": "patterns",
@@ -32,6 +40,17 @@ FINGERPRINT_ATOL = 1e-4
 """Absolute tolerance for comparing the fingerprints of two tasks."""
 PROBE_WIDTH_M = 0.02
 """Standard deviation in m of the blob that `task_fingerprint` advects."""
+INLET_VARIANCE_CUTOFF = 1e-4
+"""Modes across the inlet with a smaller fraction of the inflow's variance are dropped."""
+DEFAULT_RIDGE = 1e-6
+"""Ridge parameter, relative to the mean square of the regressors."""
+CV_RIDGES = 10.0**np.arange(-6, 3)
+"""Ridge parameters among which cross-validation chooses with ``residual_only``."""
+CV_FOLDS = 4
+"""Number of cross-validation folds of the episodes."""
+VOLTAGE_STRIDE = 3
+"""Voltages are compared at every third step only: errors of neighbouring steps are similar, and all
+injections are covered unless the cycle length is a multiple of it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -185,3 +204,175 @@ def compatible_models(folder: Path, task: Task) -> list[IdentifiedModel]:
 
 
 _load = lru_cache(maxsize=8)(IdentifiedModel.load)
+
+
+class RegressionSums(NamedTuple):
+    """Sums over states of training episodes, with past inflows s, d = c/c_0 − 1, and l the residual
+    of d from the task's flow, or d itself."""
+
+    states: int
+    inflow: np.ndarray
+    """(K·r, K·r) Σ s sᵀ"""
+    cross: np.ndarray
+    """(K·r, n) Σ s lᵀ"""
+    left: np.ndarray
+    """(n, n) Σ l lᵀ"""
+    state: np.ndarray
+    """(n, n) Σ d dᵀ"""
+    off: np.ndarray
+    """(P, L) Σ of voltage errors, in standard deviations of the noise"""
+    scatter: np.ndarray
+    """(P, L, L) Σ of their products"""
+    compared: np.ndarray
+    """(P,) number of measurement vectors in these sums"""
+
+
+def identify_model(examples: Dataset, *, modes: int = 64, residual_only: bool = False,
+                   linearised: bool = False, progress: Any = iter,
+                   source: Mapping[str, Any] | None = None) -> IdentifiedModel:
+    """Identify impulse response and voltage errors by ridge regression of states on past inflows.
+
+    In a steady flow, a state's deviation is linear in the past inflows. The concentration is
+    represented in the leading modes of the training states. The model includes the covariance of
+    the residuals and the errors of the voltages that the task's model computes.
+
+    Parameters
+    ----------
+    examples : Dataset
+        Episodes of the train split.
+    modes : int
+        q.
+    residual_only : bool
+        Keep the impulse response of the task's flow and regress only its residual, with the ridge
+        parameter of the best cross-validated prediction: for a known flow on a coarse mesh, or for
+        few episodes.
+    linearised : bool
+        Compare measurements with voltages linearised once, about ĉ_bh, and estimate the covariance
+        of the differences (`IdentifiedModel.voltage_error_covariance`).
+    progress : callable
+        Wraps the iteration over the examples; such as ``tqdm``.
+    source
+        As in `IdentifiedModel`.
+
+    Raises
+    ------
+    ValueError
+        If an episode is of another split, the world has no inflow, there are not more states than
+        modes, or there are fewer episodes than folds.
+    """
+    if others := [seed for seed in examples.seeds if seed not in SPLITS["train"]]:
+        raise ValueError("examples' seeds must be of the split train, the only one for fitting; "
+                         f"got {format_seed(others[0])}")
+    world = examples.world
+    q = _check.integer("modes", modes, low=1, high=examples.mesh.n_nodes)
+    if len(examples) * world.n_steps <= q:
+        raise ValueError(f"examples must have more states than modes, {q}; got "
+                         f"{len(examples) * world.n_steps}")
+    if residual_only and len(examples) < CV_FOLDS:
+        raise ValueError(f"examples must be at least {CV_FOLDS} episodes with residual_only, "
+                         f"got {len(examples)}")
+    task = make_task(world)
+    across = _across(world, examples.seeds)
+    told_response = steady_response(task.transport)
+    memory = told_response.weights.shape[1]
+    known = np.zeros((examples.mesh.n_nodes, memory * across.shape[1]))
+    folds = 1
+    if residual_only:
+        known = told_response.basis @ (told_response.weights @ across).reshape(-1, known.shape[1])
+        folds = CV_FOLDS
+    parts = [_together(_moments(each, world, task, across, known, linearised) for each in progress(
+        replace(examples, seeds=examples.seeds[fold::folds]))) for fold in range(folds)]
+    moments = _together(parts)
+    mass = examples.mass.toarray()
+    root = np.linalg.cholesky(mass)
+    _, vectors = np.linalg.eigh(root.T @ moments.state @ root)
+    basis = np.linalg.solve(root.T, vectors[:, :-q - 1:-1])
+    to_modes = mass @ basis
+    weights, cross, free = _regressed(moments, to_modes, _ridge(parts, to_modes))
+    explained = weights.T @ cross
+    left = (to_modes.T @ moments.left @ to_modes - explained - explained.T
+            + weights.T @ moments.inflow @ weights)
+    weights = weights + known.T @ to_modes
+    compared = np.maximum(moments.compared, 1)
+    bias = moments.off / compared[:, None]
+    scatter = moments.scatter / compared[:, None, None] - bias[:, :, None] * bias[:, None]
+    return IdentifiedModel(basis, weights.T.reshape(q, memory, -1), across,
+                           0.5 * (left + left.T) / free, task.currents, bias,
+                           task_fingerprint(task), world.background, source or {},
+                           scatter if linearised else None)
+
+
+def _together(parts: Iterable[RegressionSums]) -> RegressionSums:
+    return reduce(lambda one, other: RegressionSums(*map(add, one, other)), parts)
+
+
+def _regressed(moments: RegressionSums, to_modes: np.ndarray,
+               ridge: float) -> tuple[np.ndarray, np.ndarray, float]:
+    """Return the weights (K·r, q), Σ s lᵀ in modes, and the residual degrees of freedom."""
+    cross = moments.cross @ to_modes
+    mean_square = np.trace(moments.inflow) / len(cross)
+    ridged = moments.inflow + ridge * mean_square * np.eye(len(cross))
+    solved = np.linalg.solve(ridged, np.concatenate([cross, moments.inflow], axis=1))
+    q = cross.shape[1]
+    return solved[:, :q], cross, float(moments.states - np.trace(solved[:, q:]))
+
+
+def _ridge(parts: list[RegressionSums], to_modes: np.ndarray) -> float:
+    """Return the ridge parameter of the best cross-validation; `DEFAULT_RIDGE` for one part."""
+    if len(parts) == 1:
+        return DEFAULT_RIDGE
+    losses = np.zeros(len(CV_RIDGES))
+    for part in parts:
+        others = _together(each for each in parts if each is not part)
+        cross = part.cross @ to_modes
+        for k, ridge in enumerate(CV_RIDGES):
+            weights, *_ = _regressed(others, to_modes, ridge)
+            # squared error of the part, up to a constant
+            losses[k] += (weights * (part.inflow @ weights - 2.0 * cross)).sum()
+    return float(CV_RIDGES[losses.argmin()])
+
+
+def _across(world: World, seeds: Iterable[int]) -> np.ndarray:
+    """Return the leading orthonormal modes (n_inlet, r) of the inflow across the inlet."""
+    s = np.concatenate([world.sample_inflow(seed) for seed in seeds]) / world.background - 1.0
+    values, vectors = np.linalg.eigh(s.T @ s)
+    return vectors[:, values > INLET_VARIANCE_CUTOFF * values.sum()][:, ::-1]
+
+
+def _moments(example: Example, world: World, task: Task, across: np.ndarray, known: np.ndarray,
+             linearised: bool) -> RegressionSums:
+    """Return the sums over an episode, minus the response ``known`` (n, K·r) to past inflows."""
+    r = across.shape[1]
+    K = known.shape[1] // r
+    inflow = (world.sample_inflow(example.seed) / world.background - 1.0) @ across
+    inflow = np.concatenate([np.zeros((K, r)), inflow])             # zero before the first inflow
+    newest = len(inflow) - len(example.truth) + np.arange(len(example.truth))
+    s = inflow[newest[:, None] - np.arange(K)].reshape(-1, K * r)
+    d = example.truth / world.background - 1.0
+    l = d - s @ known.T
+    steps, errors = _errors(task, example, linearised)
+    P, L = task.currents.shape
+    off, scatter = np.zeros((P, L)), np.zeros((P, L, L))
+    np.add.at(off, steps % P, errors)
+    np.add.at(scatter, steps % P, errors[:, :, None] * errors[:, None])
+    return RegressionSums(len(d), s.T @ s, s.T @ l, l.T @ l, d.T @ d, off, scatter,
+                          np.bincount(steps % P, minlength=P))
+
+
+def _errors(task: Task, example: Example, linearised: bool) -> tuple[np.ndarray, np.ndarray]:
+    """Return indices (S,) of measurement vectors, and measured minus computed voltages (S, L) at
+    their true states, in standard deviations of the noise."""
+    truth = example.truth.astype(float)
+    if linearised:
+        first = CalibrationFrame(task)
+        for t in range(first.length):
+            first.add(example.voltages[t], example.currents[t])
+        observe = LinearisedForwardModel(task.observation, task.noise, first.mean)
+        seen = map(observe, example.voltages, example.currents)
+        errors = [(each.value - each.matrix @ c) / np.sqrt(each.noise_variance)
+                  for each, c in zip(seen, truth, strict=True)]
+        return np.arange(len(truth)), np.array(errors)
+    steps = np.arange(0, len(truth), VOLTAGE_STRIDE)
+    computed = np.array([task.observation.voltages(truth[t], example.currents[t:t + 1])[0]
+                         for t in steps])
+    return steps, (example.voltages[steps] - computed) / task.noise.std(computed)

@@ -20,9 +20,8 @@ from eitbench.estimation.covariance import (
     open_loop_arrays,
 )
 from eitbench.estimation.filter import Filter, StateSpace
-from eitbench.estimation.forward import Forward
-from eitbench.estimation.smoothness import smoothness_covariance
-from eitbench.estimation.walk import RandomWalk
+from eitbench.estimation.gaussian import Forward
+from eitbench.estimation.walk import RandomWalk, smoothness_covariance
 from eitbench.physics.stationary import StationaryTransport
 
 if TYPE_CHECKING:
@@ -149,10 +148,13 @@ class LogStates(StateSpace):
         return self.concentration(mean)**2 * variance
 
 
-def nodal_states(transport: Transport, prior: Prior, c_ref: float) -> NodalStates:
+def nodal_states(transport: Transport, prior: Prior, c_ref: float,
+                 rank_tolerance: float = FILTER_RANK_TOLERANCE) -> NodalStates:
     """Return the state space of a target's concentration with the parameters of Table 5.1.
 
-    `table_5_1_filter` uses it for a vessel with an inlet. Without an inlet the open-loop covariance
+    The evolution is c⁺ = F c + Y c_in + w. Inflow and initial state have mean ĉ_bh; Γ_η and Γ_e are
+    diagonal, Γ_{0|0} is diagonal or smooth. As all of them scale with ĉ_bh², the open-loop
+    covariance is computed once per transport model and used in all episodes. Without an inlet it
     has no limit, and the covariance is dense.
 
     Parameters
@@ -163,10 +165,14 @@ def nodal_states(transport: Transport, prior: Prior, c_ref: float) -> NodalState
         `Task.prior`.
     c_ref : float
         Best homogeneous estimate ĉ_bh in mol/m³.
+    rank_tolerance : float
+        As in `LowRankCovariance`, with an inlet.
     """
-    if len(transport.inlet) and not isinstance(transport, StationaryTransport):
-        return _flowing_states(transport, prior, c_ref)
     mean = np.full(transport.mesh.n_nodes, c_ref)
+    if len(transport.inlet) and not isinstance(transport, StationaryTransport):
+        F, Y = transport.transition()
+        flowing = LowRankCovariance(_open_loop(transport, prior), rank_tolerance, c_ref**2)
+        return NodalStates(mean, flowing, Motion(F, Y.sum(axis=1) * c_ref))
     if isinstance(transport, RandomWalk):
         motion = Motion(transport.step, noise=(c_ref * prior.nodal_std)**2 * transport.covariance)
     elif isinstance(transport, StationaryTransport):
@@ -174,7 +180,7 @@ def nodal_states(transport: Transport, prior: Prior, c_ref: float) -> NodalState
         motion = Motion(noise=walk * np.eye(len(mean)) if walk else None)
     else:
         motion = Motion(transport.evolution_model().F,
-                        noise=c_ref**2 * _state_noise(transport, prior))
+                        noise=c_ref**2 * state_noise(transport, prior, prior.inflow_std))
     covariance = c_ref**2 * initial_covariance(transport.mesh, prior)
     return NodalStates(mean, DenseCovariance(covariance), motion)
 
@@ -200,28 +206,10 @@ def modal_states(n_modes: int, std: float,
     return NodalStates(np.zeros(order * n_modes), covariance, motion_at)
 
 
-def nodal_filter(transport: Transport, prior: Prior, c_ref: float,
-                 forward: Forward | None = None) -> Filter:
+def nodal_filter(transport: Transport, prior: Prior, c_ref: float, forward: Forward | None = None,
+                 rank_tolerance: float = FILTER_RANK_TOLERANCE) -> Filter:
     """Return a filter of `nodal_states` at t = 0."""
-    return Filter(nodal_states(transport, prior, c_ref), forward)
-
-
-def table_5_1_filter(transport: Transport, prior: Prior, c_ref: float, *,
-                     rank_tolerance: float = FILTER_RANK_TOLERANCE) -> Filter:
-    """Return the Kalman filter of c⁺ = F c + Y c_in + w; arguments as in `nodal_states`.
-
-    Inflow and initial state have mean ĉ_bh; Γ_η and Γ_e are diagonal, Γ_{0|0} is diagonal or
-    smooth. As all of them scale with ĉ_bh², the open-loop covariance is computed once per transport
-    model and used in all episodes.
-    """
-    return Filter(_flowing_states(transport, prior, c_ref, rank_tolerance))
-
-
-def _flowing_states(transport: Transport, prior: Prior, c_ref: float,
-                    rank_tolerance: float = FILTER_RANK_TOLERANCE) -> NodalStates:
-    F, Y = transport.transition()
-    covariance = LowRankCovariance(_open_loop(transport, prior), rank_tolerance, c_ref**2)
-    return NodalStates(np.full(len(F), c_ref), covariance, Motion(F, Y.sum(axis=1) * c_ref))
+    return Filter(nodal_states(transport, prior, c_ref, rank_tolerance), forward)
 
 
 def flow_motion(task: Task, transition: tuple[np.ndarray, np.ndarray], c_ref: float) -> Motion:
@@ -230,7 +218,7 @@ def flow_motion(task: Task, transition: tuple[np.ndarray, np.ndarray], c_ref: fl
     The nodal part of the noise is small and takes long to compute: the task's flow determines it.
     """
     F, Y = transition
-    noise = task.prior.inflow_std**2 * (Y @ Y.T) + nodal_noise(task.transport, task.prior)
+    noise = task.prior.inflow_std**2 * (Y @ Y.T) + state_noise(task.transport, task.prior)
     return Motion(F, c_ref * Y.sum(axis=1), c_ref**2 * noise)
 
 
@@ -249,7 +237,7 @@ def _open_loop(transport: Transport, prior: Prior) -> OpenLoopCovariance:
         if (seconds := OPEN_LOOP_SECONDS * (len(F) / 1000)**3) > 2.0:
             notify(f"computing the covariance of {len(F)} nodes without measurements, about "
                    f"{seconds:.0f} s; it is cached in {key.path.parent}")
-        return open_loop_arrays(F, _state_noise(transport, prior),
+        return open_loop_arrays(F, state_noise(transport, prior, prior.inflow_std),
                                 initial_covariance(transport.mesh, prior))
 
     known_by = [array_digest(F, Y, transport.mesh.points), config_dict(prior)]
@@ -258,13 +246,6 @@ def _open_loop(transport: Transport, prior: Prior) -> OpenLoopCovariance:
 
 
 @lru_cache(maxsize=4)
-def nodal_noise(transport: Transport, prior: Prior) -> np.ndarray:
-    """Return H Γ_e Hᵀ (n, n) for ĉ_bh = 1."""
-    return transport.evolution_model().state_noise_covariance(0.0, prior.nodal_std**2)
-
-
-@lru_cache(maxsize=4)
-def _state_noise(transport: Transport, prior: Prior) -> np.ndarray:
-    """Return Γ_w (5.16) for ĉ_bh = 1."""
-    model = transport.evolution_model()
-    return model.state_noise_covariance(prior.inflow_std**2, prior.nodal_std**2)
+def state_noise(transport: Transport, prior: Prior, inflow_std: float = 0.0) -> np.ndarray:
+    """Return Γ_w (5.16) for ĉ_bh = 1, by default the part H Γ_e Hᵀ of the nodal noise."""
+    return transport.evolution_model().state_noise_covariance(inflow_std**2, prior.nodal_std**2)

@@ -47,7 +47,7 @@ class QuadraticVoltageModel:
         modes = _check.array("modes", modes, (None, None))
         n, q = modes.shape
         self._to_modes = np.linalg.pinv(modes)
-        self._resistance, table = model.resistance_derivatives(np.full(n, c_ref))
+        self._resistance, table = self._derivatives(model, np.full(n, c_ref))
         self._slope = c_ref * table.reshape(n, -1)                       # (n, L·L)
         self._curvature = np.empty((q, q, self._slope.shape[1]))
         for k, mode in enumerate(modes.T):
@@ -61,11 +61,16 @@ class QuadraticVoltageModel:
         """𝓡_0 (L, L), D (n, L·L), the map (q, n) from u to modes, and H (q, q, L·L)"""
         self._of_injection = lru_cache(maxsize=max(1, injections))(self._contracted)
 
+    def _derivatives(self, model: TransferResistanceModel,
+                     c: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the quadratic quantity (L, L) and its derivatives (n, L, L) by c."""
+        return model.resistance_derivatives(c)
+
     def _by_mode(self, model: TransferResistanceModel, modes: np.ndarray,
                  u: np.ndarray) -> np.ndarray:
         """Return the derivatives (q, L·L) by the modes at ln(c/c_0) = u."""
         c = self.c_ref * np.exp(u)
-        table = model.resistance_derivatives(c)[1]
+        table = self._derivatives(model, c)[1]
         by_mode: np.ndarray = (modes.T * c) @ table.reshape(len(c), -1)
         return by_mode
 
@@ -108,31 +113,21 @@ class ScaledVoltageModel(QuadraticVoltageModel):
     def __init__(self, model: TransferResistanceModel, c_ref: float, modes: np.ndarray) -> None:
         modes = _check.array("modes", modes, (None, None))
         with_level, _ = np.linalg.qr(np.column_stack([np.ones(len(modes)), modes]))
-        super().__init__(_Scaled(model, c_ref), c_ref, with_level)
+        super().__init__(model, c_ref, with_level)
+
+    def _derivatives(self, model: TransferResistanceModel,
+                     c: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        R, by_c = model.resistance_derivatives(c)
+        scale = self._scale(c)
+        return scale * R, scale * (by_c + R / (len(c) * c)[:, None, None])
 
     def linearise(self, concentration: np.ndarray,
                   currents: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         c = np.maximum(concentration, self.smallest)
         scaled, by_c = super().linearise(c, currents)
-        scale = _scale(c, self.c_ref)
+        scale = self._scale(c)
         return scaled / scale, (by_c - scaled[..., None] / (len(c) * c)) / scale
 
-
-class _Scaled:
-    """Scaled resistances 𝓖 and their derivatives."""
-
-    def __init__(self, model: TransferResistanceModel, c_ref: float) -> None:
-        self.model = model
-        self.c_ref = c_ref
-        self.min_concentration = model.min_concentration
-
-    def resistance_derivatives(self, concentration: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        R, by_c = self.model.resistance_derivatives(concentration)
-        scale = _scale(concentration, self.c_ref)
-        of_scale = R / (len(concentration) * concentration)[:, None, None]
-        return scale * R, scale * (by_c + of_scale)
-
-
-def _scale(c: np.ndarray, c_ref: float) -> float:
-    """Return e^ū."""
-    return float(np.exp(np.log(c / c_ref).mean()))
+    def _scale(self, c: np.ndarray) -> float:
+        """Return e^ū."""
+        return float(np.exp(np.log(c / self.c_ref).mean()))

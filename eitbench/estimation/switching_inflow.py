@@ -13,8 +13,7 @@ from scipy.linalg import solve_triangular
 from eitbench import _check
 from eitbench.estimation.covariance import DenseCovariance
 from eitbench.estimation.filter import Filter, Step
-from eitbench.estimation.forward import Forward
-from eitbench.estimation.gaussian import LinearMeasurement
+from eitbench.estimation.gaussian import Forward, LinearMeasurement
 from eitbench.estimation.inflow_window import InflowWindow, window_model
 from eitbench.worlds.task import Estimate
 

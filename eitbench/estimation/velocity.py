@@ -1,5 +1,5 @@
-"""Joint estimation of concentration and velocity, whose parameters are a random walk (thesis ch. 6;
-``docs/methods.md``, 9)."""
+"""Joint estimation of the velocity, whose parameters are a random walk, with the concentration
+(thesis ch. 6; ``docs/methods.md``, 9) or with an inflow window (``docs/methods.md``, 11)."""
 
 from __future__ import annotations
 
@@ -8,14 +8,17 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
+from scipy.linalg import block_diag
 
 from eitbench import _check
 from eitbench.estimation.covariance import Covariance, DenseCovariance
 from eitbench.estimation.filter import StateSpace
 from eitbench.estimation.inflow_response import one_step_response
-from eitbench.estimation.nodal import initial_covariance, nodal_noise
+from eitbench.estimation.inflow_window import shift_window, window_model
+from eitbench.estimation.nodal import initial_covariance, state_noise
 
 if TYPE_CHECKING:
+    from eitbench.estimation.inflow_prior import InflowPrior
     from eitbench.physics.transport import ConvectionDiffusion, VelocityField
     from eitbench.worlds.task import Task
 
@@ -83,35 +86,28 @@ class VelocityStates(StateSpace):
     takes as long to compute as F.
 
     After each measurement vector θ is moved into `VelocityPrior.bounds` by
-    `VelocityPrior.within_bounds`; concentration and covariance do not change. ``ValueError`` names
-    an argument that is out of range, of the wrong shape, or not finite.
+    `VelocityPrior.within_bounds`; concentration and covariance do not change.
 
     Parameters
     ----------
+    task : Task
+        Its prior has the standard deviations relative to ``c_ref`` (Table 5.1); its transport has
+        the nominal velocity.
+    c_ref : float
+        ĉ_bh in mol/m³: mean of the initial concentration and of the inflow.
     flow : VelocityPrior
         Prior of θ.
-    mean, covariance : (n,), (n, n)
-        Mean and covariance of the concentration at t = 0, in mol/m³ and (mol/m³)².
-    inflow, inflow_std : float
-        c_in and the standard deviation of η, both in mol/m³; ĉ_bh, the best homogeneous estimate,
-        and ĉ_bh/4 in the thesis.
-    nodal_noise : (n, n)
-        H Γ_e Hᵀ at the nominal velocity, (mol/m³)².
     """
 
-    def __init__(self, flow: VelocityPrior, mean: np.ndarray, covariance: np.ndarray, *,
-                 inflow: float, inflow_std: float, nodal_noise: np.ndarray) -> None:
+    def __init__(self, task: Task, c_ref: float, flow: VelocityPrior) -> None:
+        self.c_ref = c_ref
         self.flow = flow
-        c = _check.array("mean", mean, (None,), units="mol/m³")
-        n = self._n = len(c)
-        k = len(flow.initial)
-        self._inflow = _check.number("inflow", inflow, units="mol/m³")
-        self._inflow_std = _check.number("inflow_std", inflow_std, low=0.0, units="mol/m³")
-        self._nodal_noise = _check.array("nodal_noise", nodal_noise, (n, n))
-        self._mean = np.concatenate([c, flow.initial])
-        self._covariance = np.zeros((n + k, n + k))
-        self._covariance[:n, :n] = _check.array("covariance", covariance, (n, n))
-        self._covariance[n:, n:] = np.diag(flow.initial_std**2)
+        n = self._n = task.mesh.n_nodes
+        self._inflow_std = task.prior.inflow_std * c_ref
+        self._nodal_noise = c_ref**2 * state_noise(task.transport, task.prior)
+        self._mean = np.concatenate([np.full(n, c_ref), flow.initial])
+        self._covariance = block_diag(c_ref**2 * initial_covariance(task.mesh, task.prior),
+                                      np.diag(flow.initial_std**2))
 
     def initial(self) -> tuple[np.ndarray, Covariance]:
         return self._mean.copy(), DenseCovariance(self._covariance)
@@ -122,7 +118,7 @@ class VelocityStates(StateSpace):
         c, theta = mean[:n], mean[n:]
         transport = self.flow.transport_at(theta)
         inlet = transport.inlet
-        after, by_theta = transport.velocity_derivatives(c, c[inlet], self._inflow,
+        after, by_theta = transport.velocity_derivatives(c, c[inlet], self.c_ref,
                                                          self.flow.basis_fields)
 
         def advance(X: np.ndarray) -> np.ndarray:
@@ -149,20 +145,6 @@ class VelocityStates(StateSpace):
     def velocity(self, mean: np.ndarray,
                  covariance: Covariance) -> tuple[np.ndarray, np.ndarray]:
         return mean[self._n:].copy(), covariance.diagonal()[self._n:]
-
-
-def velocity_states(task: Task, c_ref: float, bounds: tuple[float, float]) -> VelocityStates:
-    """Return the state space of concentration and velocity, with the task's prior of the velocity.
-
-    The initial mean of the concentration and the inflow are ``c_ref`` in mol/m³. Standard
-    deviations are products of ``c_ref`` and the values in Table 5.1; ``bounds`` as in
-    `VelocityPrior`.
-    """
-    prior = task.prior
-    return VelocityStates(task_velocity_prior(task, bounds), np.full(task.mesh.n_nodes, c_ref),
-                          c_ref**2 * initial_covariance(task.mesh, prior), inflow=c_ref,
-                          inflow_std=prior.inflow_std * c_ref,
-                          nodal_noise=c_ref**2 * nodal_noise(task.transport, prior))
 
 
 def task_velocity_prior(task: Task, bounds: tuple[float, float] = (0.05, 4.0)) -> VelocityPrior:
@@ -192,3 +174,122 @@ def scaled_velocity_prior(task: Task, std: float, walk_std: float) -> VelocityPr
 
     return VelocityPrior(transport_at, [nominal], np.ones(1), np.array([std]), np.array([walk_std]),
                          np.ones((1, 1)))
+
+
+class VelocityInflowWindow(StateSpace):
+    """Last inflows x and velocities θ: z_t … z_{t−W+1}, z = (x, θ), the newest first (W·(r + k),).
+
+    The concentration is c_t = F(θ_t) c_{t−1} + Y(θ_t) c_in(x_t). Linearised in θ at each prediction
+    it is a constant plus the contributions of each of the last W inflows and θ, which are
+    propagated column by column. The link between c_in and x is linearised at each measurement
+    vector. Contributions older than W steps remain in the mean, without uncertainty.
+
+    θ is projected onto the flow's bounds, without a change of the concentration.
+
+    Parameters
+    ----------
+    task, prior, c_ref
+        As in `InflowWindow`.
+    flow : VelocityPrior
+    window_steps : int
+        W in time steps; should exceed the residence time.
+    """
+
+    def __init__(self, task: Task, prior: InflowPrior, c_ref: float, flow: VelocityPrior,
+                 window_steps: int) -> None:
+        prior.check_task(task)
+        W = self.window_steps = _check.integer("window_steps", window_steps, low=1)
+        self.prior = prior
+        self.c_ref = c_ref
+        self.flow = flow
+        r = self.n_modes = prior.modes.shape[1]
+        k = len(flow.initial)
+        self._weights, self._new_variance, covariance = window_model(prior, W, k)
+        self._new_variance[r:] = flow.walk_std**2
+        std = np.tile(np.append(np.ones(r), flow.initial_std), W)
+        self._covariance = std[:, None] * covariance * std
+        self._initialise_window(W, k)
+
+    def _initialise_window(self, W: int, k: int) -> None:
+        """Initialise the contributions of past inflows at the nominal velocity."""
+        transport = self.flow.transport_at(self.flow.initial)
+        self._inlet = transport.inlet
+        parts = [one_step_response(transport)]
+        for _ in range(W - 1):
+            parts.append(transport.step(parts[-1], parts[-1][self._inlet], 0.0))
+        by_inflow = np.stack(parts, axis=1)
+        n = len(by_inflow)
+        self._constant = self.c_ref * (1.0 - by_inflow.sum(axis=(1, 2)))
+        """(n,) part that depends on neither the last inflows nor the last θ"""
+        self._parts = np.concatenate([by_inflow, np.zeros((n, W, k))], axis=2)
+        """(n, W, n_inlet + k) contributions of c_in (mol/m³) and θ of each step, per unit"""
+
+    def initial(self) -> tuple[np.ndarray, Covariance]:
+        mean = np.zeros(self._weights.shape)
+        mean[:, self.n_modes:] = self.flow.initial
+        return mean.ravel(), DenseCovariance(self._covariance)
+
+    def propagate(self, mean: np.ndarray, covariance: Covariance,
+                  time: int) -> tuple[np.ndarray, Covariance]:
+        assert isinstance(covariance, DenseCovariance)
+        before = self.concentration(mean)
+        oldest = self._parts[:, -1] @ self._sources(mean)[-1]
+        mean = shift_window(mean, self._weights)
+        inlet = self._inlet
+        theta = self._theta(mean)
+        transport = self.flow.transport_at(theta)
+        _, by_flow = transport.velocity_derivatives(before, before[inlet],
+                                                    self._sources(mean)[0, :len(inlet)],
+                                                    self.flow.basis_fields)
+        n, W, parts = self._parts.shape
+        columns = np.concatenate([(self._constant + oldest)[:, None],
+                                  self._parts[:, :-1].reshape(n, -1)], axis=1)
+        columns = transport.step(columns, columns[inlet], 0.0)
+        self._constant = columns[:, 0] - by_flow @ theta
+        self._parts = np.concatenate([one_step_response(transport), by_flow, columns[:, 1:]],
+                                     axis=1).reshape(n, W, parts)
+        return mean, covariance.shift(self._weights, self._new_variance)
+
+    def concentration(self, mean: np.ndarray, lag: int = 0) -> np.ndarray:
+        contributions = self._parts.reshape(len(self._parts), -1) @ self._sources(mean).ravel()
+        return self._constant + contributions
+
+    def jacobian(self, mean: np.ndarray, matrix: np.ndarray) -> np.ndarray:
+        n, W, parts = self._parts.shape
+        return self._by_state(mean, (matrix @ self._parts.reshape(n, -1)).reshape(-1, W, parts))
+
+    def variance(self, mean: np.ndarray, covariance: Covariance, lag: int = 0) -> np.ndarray:
+        return covariance.variance_of(self._by_state(mean, self._parts))
+
+    def _by_state(self, mean: np.ndarray, parts: np.ndarray) -> np.ndarray:
+        """Return derivatives (m, W·(r + k)) by z, from contributions (m, W, n_inlet + k)."""
+        m = len(self._inlet)
+        by_x = self.c_ref * self.prior.derivative_by_x(parts[:, :, :m], self._inflows(mean))
+        return np.concatenate([by_x, parts[:, :, m:]], axis=2).reshape(len(parts), -1)
+
+    def constrain(self, mean: np.ndarray) -> np.ndarray:
+        free = self._theta(mean)
+        kept = self.flow.within_bounds(free)
+        self._constant += self._parts[:, 0, len(self._inlet):] @ (free - kept)
+        mean = mean.copy()
+        mean[self.n_modes:self.n_modes + len(kept)] = kept
+        return mean
+
+    def velocity(self, mean: np.ndarray,
+                 covariance: Covariance) -> tuple[np.ndarray, np.ndarray]:
+        newest = slice(self.n_modes, self._weights.shape[1])
+        return mean[newest].copy(), covariance.diagonal()[newest]
+
+    def _theta(self, mean: np.ndarray) -> np.ndarray:
+        return mean[self.n_modes:self._weights.shape[1]]
+
+    def _inflows(self, mean: np.ndarray) -> np.ndarray:
+        """Return x (W, r)."""
+        return mean.reshape(self.window_steps, -1)[:, :self.n_modes]
+
+    def _sources(self, mean: np.ndarray) -> np.ndarray:
+        """Return c_in in mol/m³ and θ of each step (W, n_inlet + k)."""
+        deviation = self._inflows(mean) @ self.prior.modes.T
+        inflows = self.c_ref * self.prior.inverse_link(deviation)
+        theta = mean.reshape(self.window_steps, -1)[:, self.n_modes:]
+        return np.concatenate([inflows, theta], axis=1)

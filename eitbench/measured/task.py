@@ -11,8 +11,7 @@ import numpy as np
 from scipy.optimize import minimize, minimize_scalar
 
 from eitbench import _check
-from eitbench.estimation.forward import LinearisedForwardModel
-from eitbench.estimation.gaussian import condition, innovate
+from eitbench.estimation.gaussian import LinearisedForwardModel, condition, innovate
 from eitbench.estimation.nodal import modal_states
 from eitbench.estimation.walk import RandomWalk, matern32_transition, matern_modes
 from eitbench.measured.calibration import Calibration

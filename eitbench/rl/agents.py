@@ -14,7 +14,7 @@ import numpy as np
 from eitbench._files import write_atomically
 from eitbench.bench.methods import baseline_folder
 from eitbench.envs.injection_core import InjectionCore, flatten_scaled
-from eitbench.estimation.onboard.onboard_filter import OnboardFilter, filters_class
+from eitbench.estimation.onboard.full_filters import filters_class
 from eitbench.estimation.onboard.rules import Rules
 from eitbench.worlds.registry import entry
 
@@ -40,7 +40,7 @@ class AgentPolicy:
     def __init__(self, rules: Rules, random: np.random.Generator) -> None:
         self.rules = rules
         self.random = random
-        self._onboard: OnboardFilter | None = None
+        self._filters: Any = None
 
     def choose(self, observation: np.ndarray, mask: np.ndarray) -> Any:
         """Return the action for a scaled observation (d,); ``mask`` (n,) bool marks the allowed
@@ -49,13 +49,13 @@ class AgentPolicy:
 
     def act(self, observation: dict[str, np.ndarray]) -> Any:
         """Return the action for a raw observation."""
-        if self._onboard is None:
+        if self._filters is None:
             kind = filters_class(self.rules, self.estimator)
             assert kind is not None
-            self._onboard = OnboardFilter(kind, self.rules, observation["frame"][None])
+            self._filters = kind(self.rules, observation["frame"][None])
         else:
-            self._onboard.assimilate(observation["voltages"][None], observation["currents"][None])
-        features = self._onboard.features()
+            self._filters.assimilate(observation["voltages"][None], observation["currents"][None])
+        features = self._filters.features()
         observation = observation | {name: array[0] for name, array in features.items()}
         n = getattr(self.rules.action_space, "n", 0)
         is_spent = self.rules.budget is not None and observation["left"][1] == 0.0

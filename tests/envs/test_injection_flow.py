@@ -18,7 +18,7 @@ from eitbench.data.episode_cache import (
 from eitbench.data.presimulation import presimulate
 from eitbench.envs.injection_core import flatten_scaled
 from eitbench.estimation.onboard.models import load_or_build_model
-from eitbench.estimation.reduced_joint import TransitionSplines
+from eitbench.estimation.reduced import TransitionSplines
 from eitbench.numerics.fem import mass_matrix
 from eitbench.worlds.catalogue import PIPE_2D_DRIFTING
 from eitbench.worlds.task import make_task

@@ -5,10 +5,11 @@ import pytest
 from eitbench.estimation import (
     CalibrationFrame,
     Filter,
+    VelocityStates,
     inflow_filter,
     linearise_at_reference,
     nodal_filter,
-    velocity_states,
+    task_velocity_prior,
 )
 from eitbench.estimation.onboard.belief import Belief
 from eitbench.estimation.onboard.full_filters import VELOCITY_BOUNDS
@@ -23,7 +24,8 @@ def of_a_baseline(name, env) -> Filter:
     if name == INFLOW:
         return inflow_filter(task, fit_world_prior(env.world), level)
     if name == FLOW:
-        return Filter(velocity_states(task, level, VELOCITY_BOUNDS), linearise_at_reference(task, level))
+        space = VelocityStates(task, level, task_velocity_prior(task, VELOCITY_BOUNDS))
+        return Filter(space, linearise_at_reference(task, level))
     return nodal_filter(task.transport, task.prior, level, linearise_at_reference(task, level))
 
 

@@ -7,17 +7,14 @@ import numpy as np
 from eitbench.estimation import (
     Filter,
     InflowPrior,
-    LinearisedForwardModel,
     LinearMeasurement,
     LowRankCovariance,
     Motion,
     NodalStates,
     OpenLoopCovariance,
-    table_5_1_filter,
 )
 from eitbench.numerics.mesh import rectangle_mesh
 from eitbench.physics.transport import ConvectionDiffusion
-from eitbench.worlds.catalogue import PIPE_2D
 from eitbench.worlds.task import make_task
 from scipy.linalg import block_diag
 
@@ -98,17 +95,6 @@ def dense_filter(model, observations):
     return steps
 
 
-def rauch_tung_striebel(model, steps):
-    """Run the backward pass over `dense_filter` with an n×n inverse per step: [smoothed] for t = 1 … T."""
-    smoothed = [steps[-1][1]]
-    for (_, filtered), (predicted, _) in zip(steps[-2::-1], steps[:0:-1], strict=True):
-        G = np.linalg.solve(predicted.covariance, model.F @ filtered.covariance).T
-        last = smoothed[-1]
-        less = G @ (last.covariance - predicted.covariance) @ G.T
-        smoothed.append(Gaussian(filtered.mean + G @ (last.mean - predicted.mean), filtered.covariance + less))
-    return smoothed[::-1]
-
-
 def stacked(models, observations):
     """Return the states x₁ … x_T given all measurements, [Gaussian], from their joint Gaussian without recursion.
 
@@ -136,34 +122,9 @@ def stacked(models, observations):
     return [Gaussian(mean[i:i + n], C[i:i + n, i:i + n]) for i in range(n, (T + 1) * n, n)]
 
 
-@lru_cache(maxsize=1)
-def pipe(steps=5):
-    """Return the thesis' pipe with n = 1701: dense model, factory of its filter, measurements, `dense_filter`.
-
-    The dense matrices are assembled from Table 5.1 here, the filter by ``table_5_1_filter``.
-    """
-    c_bh = 30.0
-    rng = np.random.default_rng(11)
-    transport, observation = PIPE_2D.estimator_model()
-    evolution = transport.evolution_model()
-    F, Y, H = evolution
-    n, m = len(F), Y.shape[1]
-    noise = evolution.state_noise_covariance((c_bh / 4)**2, (c_bh / 50)**2)
-    model = LinearGaussian(F, Y @ np.full(m, c_bh), noise, np.full(n, c_bh), (c_bh / 4)**2 * np.eye(n))
-    linearised = LinearisedForwardModel(observation, PIPE_2D.noise, np.full(n, c_bh))
-    c = c_bh * rng.uniform(0.9, 1.1, n)
-    observations = []
-    for t in range(steps):
-        c = F @ c + Y @ (c_bh * rng.uniform(0.8, 1.2, m)) + H @ (c_bh / 50 * rng.normal(size=n))
-        blank = linearised(np.zeros(PIPE_2D.vessel.n_electrodes), PIPE_2D.currents[t])
-        noise = rng.normal(size=len(blank.value)) * np.sqrt(blank.noise_variance)
-        observations.append(blank._replace(value=blank.matrix @ c + noise))
-    exact = dense_filter(model, observations)
-
-    def make_filter():
-        return table_5_1_filter(transport, PIPE_2D.prior, c_bh, rank_tolerance=1e-6)
-
-    return model, make_filter, observations, exact
+def assert_close(ours, theirs, tolerance=1e-9):
+    """Compare with a tolerance relative to the largest entry."""
+    np.testing.assert_allclose(ours, theirs, rtol=0, atol=tolerance * np.abs(theirs).max())
 
 
 class QuadraticModel:

@@ -9,7 +9,7 @@ from eitbench.bench.methods import builtin_methods, load_method
 from eitbench.data.episodes import cached_truth_model, simulate
 from eitbench.envs.injection_core import InjectionCore
 from eitbench.estimation.body_particles import SIGNAL_ERROR, BodyParticleFilter, BodyTracker, body_model
-from eitbench.estimation.onboard.body_belief import BodyBelief
+from eitbench.estimation.onboard.belief import BodyBelief
 from eitbench.estimation.onboard.rules import Rules
 from eitbench.worlds import entry
 from eitbench.worlds.bodies import TRANSITION_WIDTH, disc_indicator
@@ -172,15 +172,15 @@ def test_methods_for_stationary_targets_do_not_suit_a_body():
 
 
 def test_estimate_finds_the_body():
-    """After an episode of one pair after another the mean image is darkest at the body."""
-    world = entry(ID).world
+    """The mean image is darkest at the body, for one pair after another."""
+    world = entry(ID).world.with_changes({"schedule": {"scored_steps": 24}})
     core = InjectionCore(Rules(world), "reduced")
-    seeds = [11, 12]
+    seeds = [11]
     core.reset(seeds)
     pairs = core.rules.pairs.tolist()
     distances = []
     for k in range(core.length):
-        core.act(np.full(2, pairs.index(sorted([5 * k % 16, (5 * k + 3) % 16]))))
+        core.act(np.full(1, pairs.index(sorted([5 * k % 16, (5 * k + 3) % 16]))))
         darkest = core.task.mesh.points[core.estimate()[0].argmin(axis=1)]
         true = [world.target.path(world, episode_streams(seed).flow).centres[core.t] for seed in seeds]
         distances.append(np.linalg.norm(darkest - true, axis=1))

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from eitbench.estimation.design import pair_design_criteria, symmetric_entries
+from eitbench.estimation.onboard.belief import pair_design_criteria, symmetric_entries
 from eitbench.estimation.onboard.linearisation import electrode_pairs
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -35,24 +35,14 @@ def textbook(matrix: np.ndarray, covariance: np.ndarray, noise_variance: np.ndar
 @settings(max_examples=20)
 @given(st.integers(0, 2**32 - 1))
 def test_criteria_are_the_reductions_by_the_update(seed):
-    """The criteria of each pair are the reductions of tr(W P) and of ½ ln det P."""
+    """The criteria of each pair are the reductions of tr(W P) and of ½ ln det P; measurements with infinite noise have
+    no effect."""
     derivative, covariance, weight, noise_variance = a_state(seed)
-    traces, bits = gains_of(derivative, covariance, weight, noise_variance)
-    for k, (i, j) in enumerate(PAIRS):
-        after = textbook(derivative[i] - derivative[j], covariance, noise_variance[k])
-        assert traces[k] == pytest.approx(np.trace(weight @ (covariance - after)), rel=1e-6)
-        ratio = np.linalg.slogdet(covariance)[1] - np.linalg.slogdet(after)[1]
-        assert bits[k] == pytest.approx(0.5 * ratio, rel=1e-5, abs=1e-6)
-
-
-def test_infinite_noise_equals_a_missing_measurement():
-    """Measurements with infinite noise variance have no effect on the criteria."""
-    derivative, covariance, weight, noise_variance = a_state(0)
     noise_variance[:, 2] = np.inf
     traces, bits = gains_of(derivative, covariance, weight, noise_variance)
     kept = np.arange(L) != 2
     for k, (i, j) in enumerate(PAIRS):
         after = textbook((derivative[i] - derivative[j])[kept], covariance, noise_variance[k, kept])
-        assert traces[k] == pytest.approx(np.trace(weight @ (covariance - after)), rel=1e-8)
+        assert traces[k] == pytest.approx(np.trace(weight @ (covariance - after)), rel=1e-6)
         ratio = np.linalg.slogdet(covariance)[1] - np.linalg.slogdet(after)[1]
-        assert bits[k] == pytest.approx(0.5 * ratio, rel=1e-7)
+        assert bits[k] == pytest.approx(0.5 * ratio, rel=1e-5, abs=1e-6)

@@ -38,10 +38,9 @@ def prior(link="logarithm"):
     return two_modes(task().mesh.points[task().transport.inlet], task().transport.time_step, link)
 
 
-def record(seed=0):
+def record():
     """Return (voltages, currents) of five injections."""
-    episode = simulate(TINY, seed)
-    cycle = TINY.currents
+    episode, cycle = simulate(TINY, 0), TINY.currents
     currents = [cycle[t % len(cycle)] for t in range(TINY.n_steps)]
     return [(episode.voltages(t + 1, I, TINY), I) for t, I in enumerate(currents)]
 
@@ -50,21 +49,18 @@ def window(link="logarithm", lag=0, law=None):
     return InflowWindow(task(), law or prior(link), LEVEL, lag)
 
 
-def some_inflows(space, seed=1):
+def some_inflows(space):
     """Return a mean with random inflows."""
-    return 0.5 * np.random.default_rng(seed).standard_normal(2 * space.window_steps)
+    return 0.5 * np.random.default_rng(1).standard_normal(2 * space.window_steps)
 
 
-def stepped(inflow, lag=0):
-    """Return the concentration after inflows (W, n_inlet), the newest first, by the transport."""
-    transport = task().transport
-    deviation = np.zeros(task().mesh.n_nodes)
-    nothing = np.zeros(len(transport.inlet))
-    before = nothing
-    for after in inflow[lag:][::-1] - LEVEL:
-        deviation = transport.step(deviation, before, after)
+def stepped(inflow, transports):
+    """Return the concentration after inflows (W, n_inlet), the oldest first, by the transport of each step."""
+    state, before = np.full(task().mesh.n_nodes, LEVEL), np.full(inflow.shape[1], LEVEL)
+    for after, transport in zip(inflow, transports, strict=True):
+        state = transport.step(state, before, after)
         before = after
-    return LEVEL + deviation
+    return state
 
 
 def test_responses_of_a_time_varying_flow():
@@ -74,23 +70,20 @@ def test_responses_of_a_time_varying_flow():
     transports = [nominal, faster, nominal]
     response = time_varying_responses(lambda t: transports[t - 1], 3)[-1]
     K, inlet = response.weights.shape[1:]
-    inflow = 1.0 + 0.3 * np.random.default_rng(5).standard_normal((K + 2, inlet))        # the oldest first
-    state, before = np.zeros(task().mesh.n_nodes), np.zeros(inlet)
-    for k, after in enumerate(inflow):
-        state = transports[max(k - K + 1, 0)].step(state, before, after)
-        before = after
-    made = response.basis @ np.tensordot(response.weights, inflow[::-1][:K], 2)
-    assert np.linalg.norm(made - state) < 0.02 * np.linalg.norm(state)                   # 0.01 is forgotten
+    inflow = LEVEL + np.random.default_rng(5).standard_normal((K + 2, inlet))            # the oldest first
+    change = stepped(inflow, [transports[max(k - K + 1, 0)] for k in range(K + 2)]) - LEVEL
+    made = response.basis @ np.tensordot(response.weights, inflow[::-1][:K] - LEVEL, 2)
+    assert np.linalg.norm(made - change) < 0.02 * np.linalg.norm(change)                 # 0.01 is forgotten
 
 
-@pytest.mark.parametrize("link", ["linear", "logarithm"])
-@pytest.mark.parametrize("lag", [0, 2])
+@pytest.mark.parametrize(("link", "lag"), [("linear", 0), ("logarithm", 2)])
 def test_window_agrees_with_the_transport(link, lag):
     """Concentrations agree with the transport to 3e-3 of their change, the truncated part of the response."""
     space = window(link, lag)
     mean = some_inflows(space)
-    u = mean.reshape(-1, 2)[:lag + space.response_steps] @ prior(link).modes.T
-    expected = stepped(LEVEL * (np.exp(u) if link == "logarithm" else 1.0 + u), lag)
+    u = mean.reshape(-1, 2)[lag:lag + space.response_steps][::-1] @ prior(link).modes.T
+    inflow = LEVEL * (np.exp(u) if link == "logarithm" else 1.0 + u)
+    expected = stepped(inflow, [task().transport] * len(inflow))
     off = space.concentration(mean, lag) - expected
     assert np.linalg.norm(off) < 3e-3 * np.linalg.norm(expected - LEVEL)
 
@@ -131,38 +124,29 @@ def test_prediction_keeps_the_prior():
     assert not filter_.mean.any()
 
 
-@lru_cache(maxsize=1)
-def most_probable():
-    smoother = full_window_filter(task(), prior(), LEVEL, record())
-    first = smoother.mean.copy()
-    maximise_posterior(smoother, task(), record())
-    return smoother, first
-
-
-def density(smoother, x, std):
-    """Return −2 ln of the posterior density as the sum of prior and misfit."""
-    space = smoother.space
-    precision = np.linalg.inv(toeplitz(prior().time_covariance(space.window_steps)))
-    value = np.einsum("ik,ij,jk->", x.reshape(-1, 2), precision, x.reshape(-1, 2))
-    for t, (voltages, currents) in enumerate(record()):
-        there = task().observation.voltages(space.concentration(x, len(record()) - 1 - t), currents[None])[0]
-        value += (((voltages - there) / std[t])**2).sum()
-    return value
-
-
 def test_map_estimate_maximises_the_density():
-    """Steps in twenty random directions, and the result of the linear smoother, have a lower density."""
-    smoother, first = most_probable()
-    best, at = smoother.mean, smoother.space.concentration
-    std = [task().noise.std(task().observation.voltages(at(first, len(record()) - 1 - t), I[None])[0])
-           for t, (_, I) in enumerate(record())]
-    least = density(smoother, best, std)
-    assert least < density(smoother, first, std)
-    random = np.random.default_rng(2)
-    for _ in range(20):
-        step = 0.05 * random.standard_normal(best.shape)
-        assert density(smoother, best + step, std) > least
-        assert density(smoother, best - step, std) > least
+    """Steps in ten random directions, and the result of the linear smoother, have a lower density."""
+    measurements = record()
+    smoother = full_window_filter(task(), prior(), LEVEL, measurements)
+    first, space = smoother.mean.copy(), smoother.space
+    maximise_posterior(smoother, task(), measurements)
+    precision = np.linalg.inv(toeplitz(prior().time_covariance(space.window_steps)))
+
+    def computed(x):
+        return np.array([task().observation.voltages(space.concentration(x, len(measurements) - 1 - t), I[None])[0]
+                         for t, (_, I) in enumerate(measurements)])
+
+    std, voltages = task().noise.std(computed(first)), np.array([V for V, _ in measurements])
+
+    def surprise(x):
+        prior_term = np.einsum("ik,ij,jk->", x.reshape(-1, 2), precision, x.reshape(-1, 2))
+        return prior_term + (((voltages - computed(x)) / std)**2).sum()
+
+    least, random = surprise(smoother.mean), np.random.default_rng(2)
+    assert least < surprise(first)
+    for _ in range(10):
+        step = 0.05 * random.standard_normal(first.shape)
+        assert min(surprise(smoother.mean + step), surprise(smoother.mean - step)) > least
 
 
 def test_fits_the_law_of_the_samples():
@@ -170,7 +154,7 @@ def test_fits_the_law_of_the_samples():
     random = np.random.default_rng(4)
     E = np.array([[0.2, 0.0], [0.15, 0.1], [0.0, 0.2]])
     off = []
-    for episodes in (5, 2000):
+    for episodes in (5, 1000):
         x = np.zeros((episodes, 100, 2))
         x[:, 0] = random.standard_normal((episodes, 2))
         for t in range(1, 100):
@@ -178,7 +162,7 @@ def test_fits_the_law_of_the_samples():
         learned = fit_inflow_prior(np.exp(x @ E.T), np.zeros((3, 2)), 0.005, nugget=0.0)
         off.append(np.abs(learned.modes @ learned.modes.T - E @ E.T).max() / (E @ E.T).max())
         np.testing.assert_allclose(learned.correlation[:4], 0.7**np.arange(4), atol=0.1)
-    assert off[1] < 0.02 and off[1] < off[0] / 3
+    assert off[1] < 0.03 and off[1] < off[0] / 3
 
 
 def test_correlation_is_positive_semidefinite():

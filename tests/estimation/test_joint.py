@@ -1,11 +1,18 @@
 """The joint filter of concentration and velocity is compared with the textbook, differences and a simulated truth."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
-from eitbench.estimation import Filter, LinearMeasurement, VelocityPrior, VelocityStates
+from eitbench.estimation import DenseCovariance, Filter, LinearMeasurement, VelocityPrior, VelocityStates
+from eitbench.worlds.task import make_task
+from eitbench.worlds.world import Prior
 from models import MESH, averages, coarse_transport, directions, shapes, textbook_update, theta_of
+from scipy.linalg import block_diag
 
-C_BH, N = 30.0, 147
+from tiny_worlds import TINY
+
+C_BH, N, PRIOR = 30.0, 147, Prior()
 NOMINAL, STD = np.array([4.5, 0.0, 0.0]), np.array([1.0, 2.0, 0.5])
 
 
@@ -18,18 +25,12 @@ def relative(k):
     return shapes(k) / (shapes(k) @ NOMINAL[:k])[:, None]
 
 
-def nodal_noise():
-    root = np.random.default_rng(0).normal(size=(N, 20))
-    return 0.01 * root @ root.T
-
-
-def joint_filter(k=1, **changes):
-    given = {"start": NOMINAL[:k], "start_std": STD[:k], "walk_std": np.full(k, 0.02), "profiles": shapes(k),
-             "bounds": (0.01, 4.0), "mean": np.full(N, C_BH), "covariance": 50.0 * np.eye(N), "inflow": C_BH,
-             "inflow_std": C_BH / 4, "nodal_noise": nodal_noise()} | changes
-    flow = VelocityPrior(transport_at, directions(k), *(given.pop(name) for name in (
-        "start", "start_std", "walk_std", "profiles", "bounds")))
-    return Filter(VelocityStates(flow, **given))
+def joint_filter(k=1, prior=PRIOR, **changes):
+    flow = VelocityPrior(transport_at, directions(k), **{
+        "initial": NOMINAL[:k], "initial_std": STD[:k], "walk_std": np.full(k, 0.02), "profiles": shapes(k),
+        "bounds": (0.01, 4.0)} | changes)
+    task = replace(make_task(TINY), transport=transport_at([4.5]), prior=prior)
+    return Filter(VelocityStates(task, C_BH, flow))
 
 
 def sensors(rng, m=16):
@@ -54,9 +55,8 @@ def test_one_step_equals_the_textbook():
     F, Y = transport.transition()
     after, by_theta = transport.velocity_derivatives(c, c[:7], C_BH, directions(3))
     A = np.block([[F, by_theta], [np.zeros((3, N)), np.eye(3)]])
-    noise = np.zeros((N + 3, N + 3))
-    noise[:N, :N] = (C_BH / 4)**2 * Y @ Y.T + nodal_noise()
-    noise[N:, N:] = 0.02**2 * np.eye(3)
+    nodal_noise = transport_at([4.5]).evolution_model().state_noise_covariance(0.0, (C_BH / 50)**2)
+    noise = block_diag((C_BH / 4)**2 * Y @ Y.T + nodal_noise, 0.02**2 * np.eye(3))
     mean, P = np.concatenate([after, theta]), A @ P @ A.T + noise
 
     filter_.predict()
@@ -75,36 +75,32 @@ def test_one_step_equals_the_textbook():
 
 
 def test_covariance_moves_with_the_derivative_of_the_prediction():
-    """Without noise the covariance becomes A Γ Aᵀ, with A the finite differences of `predict` by (c, θ)."""
+    """Without noise the covariance G Gᵀ becomes A G Gᵀ Aᵀ, with A G finite differences of `predict` by (c, θ)."""
     rng, k, h = np.random.default_rng(3), 3, 1e-4
     c, theta = C_BH + 3 * rng.normal(size=N), np.array([4.0, 1.0, 0.4])
-    quiet = {"nodal_noise": np.zeros((N, N)), "inflow_std": 0.0, "walk_std": np.zeros(k)}
+    filter_ = joint_filter(k, Prior(inflow_std=0.0, nodal_std=0.0), walk_std=np.zeros(k))
 
     def predicted(state):
-        filter_ = joint_filter(k, mean=state[:N], start=state[N:], **quiet)
+        filter_.mean = state
         filter_.predict()
         return filter_.mean
 
-    start = np.concatenate([c, theta])
-    A = np.stack([(predicted(start + e) - predicted(start - e)) / (2 * h) for e in h * np.eye(N + k)], axis=1)
-    root = rng.normal(size=(N, N))
-    filter_ = joint_filter(k, mean=c, start=theta, covariance=root @ root.T / N, start_std=np.array([1.0, 0.7, 0.4]),
-                           **quiet)
-    before = filter_.covariance.array.copy()
+    start, G = np.concatenate([c, theta]), rng.normal(size=(8, N + k))
+    moved = np.stack([(predicted(start + h * g) - predicted(start - h * g)) / (2 * h) for g in G], axis=1)
+    filter_.mean, filter_.covariance = start, DenseCovariance(G.T @ G)
     filter_.predict()
-    expected = A @ before @ A.T
+    expected = moved @ moved.T
     assert np.abs(expected[:N, N:]).max() > 0.1                                         # the velocity shows
     np.testing.assert_allclose(filter_.covariance.array, expected, atol=1e-7 * np.abs(expected).max())
 
 
-@pytest.mark.parametrize("truth", [[3.2], [5.8], [4.0, 1.2, 0.4]], ids=["slow", "fast", "skew"])
-def test_velocity_is_estimated(truth):
+def test_velocity_is_estimated():
     """For a truth of the filter's model, one to two σ from the prior, θ is within 3σ and the profile within 5 %."""
-    rng, truth = np.random.default_rng(4), np.array(truth)
+    rng, truth = np.random.default_rng(4), np.array([4.0, 1.2, 0.4])
     k, transport = len(truth), transport_at(truth)
-    filter_ = joint_filter(k, walk_std=np.zeros(k), nodal_noise=1e-4 * np.eye(N))
+    filter_ = joint_filter(k, Prior(nodal_std=1e-4), walk_std=np.zeros(k))
     c = transport.step(np.full(N, C_BH), C_BH, C_BH)
-    for _ in range(80):
+    for _ in range(60):
         c = transport.step(c, c[:7], C_BH + C_BH / 4 * rng.normal(size=7))
         H = sensors(rng)
         filter_.predict()
@@ -116,8 +112,7 @@ def test_velocity_is_estimated(truth):
     assert np.linalg.norm(shapes(k) @ miss) < 0.05 * np.linalg.norm(shapes(k) @ truth)
 
 
-@pytest.mark.parametrize(("k", "far"), [(1, -8.0), (1, 40.0), (3, -8.0), (3, 40.0)],
-                         ids=["backwards", "too fast", "skew backwards", "skew too fast"])
+@pytest.mark.parametrize(("k", "far"), [(1, -8.0), (3, 40.0)], ids=["backwards", "skew too fast"])
 def test_velocity_stays_within_its_bounds(k, far):
     """If a measurement implies a θ beyond the bounds, θ is at the bound on the line from θ_0; c is not constrained."""
     filter_, observation = started(np.random.default_rng(5), k)
@@ -144,11 +139,9 @@ def test_velocity_stays_within_its_bounds(k, far):
 
 
 @pytest.mark.parametrize(("changes", "name"), [
-    ({"mean": np.zeros((N, 1))}, "^mean"), ({"covariance": np.eye(N - 1)}, "^covariance"),
-    ({"start": np.array([4.5, 0.0])}, "^initial"), ({"start": np.array([np.nan])}, "^initial"),
-    ({"inflow_std": -1.0}, "^inflow_std"), ({"nodal_noise": np.ones(N)}, "^nodal_noise"),
-    ({"profiles": np.ones((5, 2))}, "^profiles"), ({"profiles": np.zeros((5, 1))}, "^profiles"),
-    ({"bounds": (0.0, 5.0)}, "^bounds"), ({"bounds": (0.1, 0.9)}, "^bounds"), ({"bounds": (1.5, 2.0)}, "^bounds"),
+    ({"initial": np.array([4.5, 0.0])}, "^initial"), ({"walk_std": np.array([0.1, 0.1])}, "^walk_std"),
+    ({"profiles": -np.ones((5, 1))}, r"^profiles must give a positive velocity with initial, got -4\.5"),
+    ({"bounds": (0.0, 5.0)}, "^bounds must be a range"), ({"bounds": (1.5, 2.0)}, "^bounds must be a range"),
 ])
 def test_errors_name_the_argument(changes, name):
     """Wrong shapes, profiles at walls, and bounds that exclude the nominal velocity raise an error with the name."""

@@ -1,5 +1,5 @@
-"""The joint filter of inflow and velocity is compared with the transport, the filter of a known velocity, the joint
-filter with a white inflow, and a simulated truth."""
+"""The joint filter of inflow and velocity is compared with the transport, and with the joint filter of a white
+inflow."""
 
 from dataclasses import replace
 from functools import lru_cache
@@ -7,6 +7,7 @@ from functools import lru_cache
 import numpy as np
 import pytest
 from eitbench.estimation import (
+    DenseCovariance,
     Filter,
     LinearMeasurement,
     VelocityInflowWindow,
@@ -17,14 +18,12 @@ from eitbench.estimation import (
 )
 from eitbench.worlds.catalogue import PIPE_2D_SKEWED, STATIONARY_TANK_2D
 from eitbench.worlds.task import make_task
-from models import MESH, averages, coarse_transport, directions, shapes, theta_of, two_modes, white_inflow
+from models import MESH, assert_close, averages, coarse_transport, directions, shapes, theta_of, two_modes, white_inflow
+from scipy.linalg import block_diag
 
 from tiny_worlds import TINY
 
 LEVEL, N = 29.0, 147
-
-
-DIRECTIONS = directions(2)
 
 
 def transport_at(theta):
@@ -33,7 +32,7 @@ def transport_at(theta):
 
 def flow(std=(1.0, 2.0), walk=(0.05, 0.02)):
     """Return the prior of v = θ_1 v_1 + θ_2 v_2 with nominal mean 4.5 m/s, a residence time of 18 steps."""
-    return VelocityPrior(transport_at, DIRECTIONS, np.array([4.5, 0.0]), np.array(std), np.array(walk), shapes(2))
+    return VelocityPrior(transport_at, directions(2), np.array([4.5, 0.0]), np.array(std), np.array(walk), shapes(2))
 
 
 def started(belief, window, law=None):
@@ -55,10 +54,6 @@ def observations(count, seed=5, m=8):
     for _ in range(count):
         H = averages(MESH, random, m)
         yield LinearMeasurement(H, LEVEL + 3.0 * random.normal(size=m), np.full(m, 0.1))
-
-
-def near(actual, expected, part):
-    np.testing.assert_allclose(actual, expected, atol=part * np.abs(expected).max(), rtol=0)
 
 
 def stepped(z, steps):
@@ -83,14 +78,14 @@ def test_concentration_and_derivatives_are_those_of_the_transport():
     for _ in range(steps):
         filter_.predict()
     z = np.concatenate([start[::-1], filter_.mean.reshape(W, 4)[:steps][::-1]])
-    near(filter_.concentration, stepped(z, steps), 1e-10)
+    assert_close(filter_.concentration, stepped(z, steps), 1e-10)
     slope = filter_.space.jacobian(filter_.mean, np.eye(N)).reshape(N, W, 4)
     for k, part in [(0, 0), (3, 1), (6, 0), (0, 2), (0, 3), (1, 2), (3, 2), (3, 3)]:
         change = np.zeros_like(z)
         change[-1 - k, part] = h
         difference = (stepped(z + change, steps) - stepped(z - change, steps)) / (2 * h)
         assert np.abs(difference).max() > 1e-3
-        near(slope[:, k, part], difference, 1e-6)
+        assert_close(slope[:, k, part], difference, 1e-6)
 
 
 def test_a_white_inflow_gives_the_joint_filter():
@@ -100,8 +95,10 @@ def test_a_white_inflow_gives_the_joint_filter():
     belief = flow(walk=(0.0, 0.0))
     filter_ = started(belief, 90, white_inflow(task()))
     slope = filter_.space.jacobian(filter_.mean, np.eye(N))
-    joint = Filter(VelocityStates(belief, np.full(N, LEVEL), slope @ filter_.covariance.array @ slope.T, inflow=LEVEL,
-                                  inflow_std=task().prior.inflow_std * LEVEL, nodal_noise=np.zeros((N, N))))
+    quiet = replace(task(), prior=replace(task().prior, nodal_std=0.0))
+    joint = Filter(VelocityStates(quiet, LEVEL, belief))
+    joint.covariance = DenseCovariance(block_diag(slope @ filter_.covariance.array @ slope.T,
+                                                  np.diag(belief.initial_std**2)))
     for observation in observations(10):
         found = []
         for each in (filter_, joint):
@@ -110,49 +107,23 @@ def test_a_white_inflow_gives_the_joint_filter():
             found.append([step.innovation, step.innovation_covariance, each.concentration, each.variance,
                           *theta_of(each)])
         for ours, theirs in zip(*found, strict=True):
-            near(ours, theirs, 1e-7)
+            assert_close(ours, theirs, 1e-7)
     assert np.linalg.norm(theta_of(filter_)[0] - belief.initial) > 0.1
 
 
-@pytest.mark.parametrize("truth", [[3.4, 0.0], [5.0, 1.2]], ids=["slow", "skew"])
-def test_velocity_is_estimated(truth):
-    """For inflows sampled from the prior and a velocity one to two σ from its mean, θ is within 5 % and within 3σ."""
-    random = np.random.default_rng(3)
-    process = np.linalg.cholesky(np.array([[prior().time_covariance(80)[abs(i - j)] for i in range(80)]
-                                           for j in range(80)])) @ random.standard_normal((80, 2))
-    filter_ = started(flow(walk=(0.0, 0.0)), 30)
-    transport = transport_at(truth)
-    c, before = np.full(N, LEVEL), LEVEL
-    for t, x in enumerate(process):
-        after = LEVEL * np.exp(prior().modes @ x)
-        c = transport.step(c, before, after)
-        before = after
-        if t < 30:
-            continue
-        (seen,) = observations(1, seed=t)
-        filter_.predict()
-        filter_.update(seen._replace(value=seen.matrix @ c + 0.3 * random.normal(size=len(seen.value))))
-    theta, variance = theta_of(filter_)
-    off, std = theta - truth, np.sqrt(variance)
-    assert (np.abs(off) < 3 * std).all()
-    assert np.linalg.norm(off) < 0.05 * np.linalg.norm(truth)
-
-
 def test_velocity_stays_within_its_bounds():
-    """A measurement that implies backflow moves the velocity to its lower bound."""
-    filter_ = started(flow((3.0, 0.0), (0.05, 0.0)), 12)
+    """Backflow is moved to the lower bound, without a change of the concentration."""
+    filter_ = started(flow(), 12)
     for observation in observations(4):
         filter_.predict()
         filter_.update(observation)
-    filter_.predict()
-    (observation,) = observations(1, seed=8)
-    slope = filter_.space.jacobian(filter_.mean, observation.matrix)
-    by_theta = slope @ filter_.covariance.array[:, 2]                           # derivatives by θ_1
-    value = observation.matrix @ filter_.concentration - 1e3 * by_theta
-    filter_.update(observation._replace(value=value))
-    assert theta_of(filter_)[0][0] == pytest.approx(0.05 * 4.5)
-    filter_.predict()
-    assert np.isfinite(filter_.concentration).all()
+    c, mean = filter_.concentration.copy(), filter_.mean.copy()
+    change = np.array([-2.0 - mean[2], 0.0])
+    mean[2:4] += change
+    filter_.space._constant -= filter_.space._parts[:, 0, 7:] @ change                  # backflow, with the same c
+    kept = filter_.space.constrain(mean)
+    assert (shapes(2) @ kept[2:4] / (4.5 * shapes(1)[:, 0])).min() == pytest.approx(0.05)
+    assert_close(filter_.space.concentration(kept), c)
 
 
 def test_velocity_priors_of_a_task():
@@ -164,7 +135,7 @@ def test_velocity_priors_of_a_task():
     c = LEVEL + np.random.default_rng(0).normal(size=N)
     for factor in (1.0, 1.2):
         there = told.transport_at(np.array([factor])).step(c, LEVEL, LEVEL)
-        near(there, transport_at([factor * 4.5, 0.0]).step(c, LEVEL, LEVEL), 1e-12)
+        assert_close(there, transport_at([factor * 4.5, 0.0]).step(c, LEVEL, LEVEL), 1e-12)
     assert (told.initial_std, told.walk_std) == (0.3, 0.01)
 
 
@@ -173,13 +144,7 @@ def test_invalid_arguments_are_rejected():
         task_velocity_prior(task())
     with pytest.raises(ValueError, match="task must have a flow, got StationaryTransport"):
         scaled_velocity_prior(make_task(STATIONARY_TANK_2D), 0.3, 0.0)
-    with pytest.raises(ValueError, match="walk_std"):
-        flow(walk=(0.1,))
-    with pytest.raises(ValueError, match=r"profiles must give a positive velocity with initial, got -4\.5"):
-        replace(flow(), profiles=-np.ones((3, 2)))
     with pytest.raises(ValueError, match="window"):
         started(flow(), 0)
-    with pytest.raises(ValueError, match="bounds must be a range"):
-        replace(flow(), bounds=(0.5, 0.9))
     with pytest.raises(ValueError, match="the prior must be for the task's inlet"):
         VelocityInflowWindow(make_task(TINY), prior(), LEVEL, flow(), 12)

@@ -1,6 +1,5 @@
 """The smoothness prior agrees with its continuum, and for a stationary tank the filter is a linearised MAP estimate."""
 
-from functools import lru_cache
 from types import SimpleNamespace
 
 import numpy as np
@@ -12,6 +11,7 @@ from eitbench.numerics.round_meshes import uniform_disc
 from eitbench.worlds.bodies import disc_indicator
 from eitbench.worlds.catalogue import STATIONARY_TANK_2D
 from eitbench.worlds.task import make_task
+from models import assert_close
 from scipy.linalg import cho_factor, cho_solve, eigvalsh
 from scipy.special import kv
 
@@ -30,18 +30,13 @@ def node_at(mesh, x, y):
     return int(np.hypot(*(mesh.points - np.array([x, y])).T).argmin())
 
 
-def test_covariance_is_symmetric_and_positive_definite(square):
-    """Γ is exactly symmetric, and its smallest eigenvalue is far above rounding."""
-    np.testing.assert_array_equal(square.covariance, square.covariance.T)
-    values = eigvalsh(square.covariance)
-    assert values[0] > 1e-6 * values[-1]
-
-
-@pytest.mark.parametrize("std", [0.5, 2.0])
-def test_mean_variance_equals_the_argument(std):
-    """∫ Γ(x, x) dx over the area is std², on a mesh of non-uniform cells."""
-    mesh = uniform_disc(0.14, 12)
+def test_mean_variance_equals_the_argument():
+    """∫ Γ(x, x) dx over the area is std², on a mesh of non-uniform cells; Γ is symmetric and positive definite."""
+    mesh, std = uniform_disc(0.14, 12), 0.5
     covariance = smoothness_covariance(mesh, 0.03, std)
+    np.testing.assert_array_equal(covariance, covariance.T)
+    values = eigvalsh(covariance)
+    assert values[0] > 1e-6 * values[-1]
     weights = np.asarray(mass_matrix(mesh).sum(axis=0)).ravel()
     assert weights @ covariance.diagonal() / weights.sum() == pytest.approx(std**2, rel=1e-12)
     # the variance is larger near the wall
@@ -83,73 +78,29 @@ C_BH = 32.0
 """Substitute for ĉ_bh in mol/m³: linearisation point of the voltages and prior mean."""
 
 
-@lru_cache(maxsize=1)
-def frame():
-    """Return the tank's task, and one frame of voltages that the estimator's model computes for a disc, with noise."""
-    task = make_task(STATIONARY_TANK_2D)
-    rng = np.random.default_rng(4)
-    target = 30.0 * (1.0 + disc_indicator(task.mesh.points, np.array([0.05, 0.02]), 0.03, 0.01))
-    clean = task.observation.voltages(target, task.currents)
-    assert len(task.currents) == 16
-    return task, clean + task.noise.std(clean) * rng.standard_normal(clean.shape)
-
-
-def filtered(order):
-    """Return mean and full covariance of the filter with F = I after injections in this order."""
-    task, voltages = frame()
-    filter_ = nodal_filter(task.transport, task.prior, C_BH)
-    observe = LinearisedForwardModel(task.observation, task.noise, np.full(task.mesh.n_nodes, C_BH))
-    for k in order:
-        filter_.predict()
-        filter_.update(observe(voltages[k], task.currents[k]))
-    return filter_.mean, filter_.covariance.array
-
-
-def prior():
-    """Return Γ computed from the task's mesh and parameters."""
-    task, _ = frame()
-    return smoothness_covariance(task.mesh, task.prior.initial_length, C_BH * task.prior.initial_std)
-
-
-def linear_model():
-    """Return R(c*) (16, L), J (16, L, n) and the noise standard deviations at c* = ĉ_bh."""
-    task, _ = frame()
-    computed, jacobian = task.observation.linearise(np.full(task.mesh.n_nodes, C_BH), task.currents)
-    return computed, jacobian, task.noise.std(computed)
-
-
-def assert_close(one, other, tolerance):
-    """Compare with a tolerance relative to the largest entry."""
-    np.testing.assert_allclose(one, other, rtol=0.0, atol=tolerance * np.abs(other).max())
-
-
 def test_filter_of_a_frame_is_the_linearised_map_estimate():
     """Mean and covariance after 16 injections minimise ‖L_v(V − R(c*) − J(c − c*))‖² + (c − c₀)ᵀ Γ⁻¹ (c − c₀), to 1e-8.
 
     c₀ = c* = ĉ_bh; the matrix of the normal equations is the inverse of the covariance.
     """
-    computed, jacobian, std = linear_model()
-    n = jacobian.shape[-1]
-    weighted = jacobian.reshape(-1, n) / std.ravel()[:, None]
-    residual = (frame()[1] - computed).ravel() / std.ravel()
-    information = cho_factor(weighted.T @ weighted + cho_solve(cho_factor(prior()), np.eye(n)))
-    mean, covariance = filtered(range(16))
-    assert_close(mean - C_BH, cho_solve(information, weighted.T @ residual), 1e-8)
+    task = make_task(STATIONARY_TANK_2D)
+    n, rng = task.mesh.n_nodes, np.random.default_rng(4)
+    target = 30.0 * (1.0 + disc_indicator(task.mesh.points, np.array([0.05, 0.02]), 0.03, 0.01))
+    clean = task.observation.voltages(target, task.currents)
+    voltages = clean + task.noise.std(clean) * rng.standard_normal(clean.shape)
+    filter_ = nodal_filter(task.transport, task.prior, C_BH)
+    observe = LinearisedForwardModel(task.observation, task.noise, np.full(n, C_BH))
+    for measurement in zip(voltages, task.currents, strict=True):
+        filter_.predict()
+        filter_.update(observe(*measurement))
+    computed, jacobian = task.observation.linearise(np.full(n, C_BH), task.currents)
+    std = task.noise.std(computed).ravel()
+    weighted, residual = jacobian.reshape(-1, n) / std[:, None], (voltages - computed).ravel() / std
+    prior = smoothness_covariance(task.mesh, task.prior.initial_length, C_BH * task.prior.initial_std)
+    information = cho_factor(weighted.T @ weighted + cho_solve(cho_factor(prior), np.eye(n)))
+    covariance = filter_.covariance.array
+    assert_close(filter_.mean - C_BH, cho_solve(information, weighted.T @ residual), 1e-8)
     assert_close(covariance, cho_solve(information, np.eye(n)), 1e-8)
     # the data reduce the variance
-    assert np.ptp(mean) > 10.0
-    assert covariance.trace() < 0.7 * prior().trace()
-
-
-def test_evolution_is_the_identity():
-    """The evolution model has F = I, an H as in other tasks, and an empty inlet: nodal noise is added directly."""
-    task, _ = frame()
-    n = task.mesh.n_nodes
-    F, Y, H = task.evolution
-    np.testing.assert_array_equal(F, np.eye(n))
-    np.testing.assert_array_equal(H, np.eye(n))
-    assert Y.shape == (n, 0)
-    c = np.random.default_rng(0).normal(30.0, 5.0, n)
-    np.testing.assert_array_equal(task.transport.step(c), F @ c)
-    covariance = task.evolution.state_noise_covariance(2.0, 0.3)
-    np.testing.assert_allclose(covariance, 0.3 * np.eye(n), rtol=1e-14)
+    assert np.ptp(filter_.mean) > 10.0
+    assert covariance.trace() < 0.7 * prior.trace()

@@ -1,17 +1,20 @@
-"""Belief of an injection policy: the filter inside the environment, rerun from its observations."""
+"""Belief of an injection policy: the filter inside the environment, rerun from its observations,
+and the design criteria of the next injection."""
 
 from __future__ import annotations
 
-from functools import cached_property, lru_cache
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
+import scipy.sparse as sp
 
 from eitbench.data.episode_cache import scoring_constants
-from eitbench.estimation.design import pair_design_criteria, symmetric_entries
-from eitbench.estimation.onboard.body_belief import BodyBelief, PolicyBelief
+from eitbench.estimation.body_particles import SIGNAL_ERROR, measured_first
+from eitbench.estimation.onboard.body_filters import BodyFilters
 from eitbench.estimation.onboard.linearisation import linearisation_table
 from eitbench.estimation.onboard.reduced_filters import ReducedFilters
+from eitbench.worlds.bodies import reflect
 
 if TYPE_CHECKING:
     from eitbench.estimation.onboard.linearisation import Linearisation
@@ -23,7 +26,55 @@ FAULT_DECAY = 0.8
 """Factor per step of the score after failed injections, while the electrode is not driven."""
 
 
-class Belief(PolicyBelief):
+def symmetric_entries(n_electrodes: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return the indices (N,) of the upper triangle in 𝓡 (L, L) as L² numbers, and the row (L, L)
+    of each entry among them."""
+    rows, columns = np.triu_indices(n_electrodes)
+    number = np.empty((n_electrodes, n_electrodes), dtype=int)
+    number[rows, columns] = number[columns, rows] = np.arange(len(rows))
+    return rows * n_electrodes + columns, number
+
+
+def pair_design_criteria(
+        voltage_covariance: np.ndarray, weighted_voltage_covariance: np.ndarray,
+        entries: tuple[np.ndarray, np.ndarray],
+        noise_variance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the A- and D-criterion of an injection through each pair, (p,) and (p,).
+
+    They are the reduction of tr(W P) (A-optimality) and half the reduction of ln det P
+    (D-optimality). D (N, n) holds the derivatives of the entries of 𝓡 by the n states. The voltages
+    are bilinear in the driving pair and the measuring electrode, so one table of products of the
+    covariance serves every pair (``docs/methods.md``, 8); 𝓡 is symmetric, with N = L(L + 1)/2
+    different entries.
+
+    Parameters
+    ----------
+    voltage_covariance : (N, N)
+        D P Dᵀ, with the state's covariance P just before the measurement.
+    weighted_voltage_covariance : (N, N)
+        D P W P Dᵀ, with the weight W of state errors.
+    entries : (p, m) and (p, m)
+        Rows of D whose difference is the derivative of each of a pair's m voltages, from
+        `symmetric_entries`: of the electrodes where the current enters and leaves.
+    noise_variance : (p, m)
+        Noise of the voltages, per current squared; infinite for rejected measurements.
+    """
+    i, j = entries
+    root = 1.0 / np.sqrt(noise_variance)              # zero for rejected measurements
+    scale = root[:, :, None] * root[:, None, :]
+    flat = [one[:, :, None] * len(voltage_covariance) + other[:, None, :]
+            for one, other in ((i, i), (i, j), (j, j))]
+
+    def whiten(table: np.ndarray) -> np.ndarray:
+        entering, mixed, leaving = (table.take(each) for each in flat)
+        return scale * (entering + leaving - mixed - mixed.swapaxes(1, 2))
+
+    S = whiten(voltage_covariance) + np.eye(root.shape[1])
+    gains = (np.linalg.inv(S) * whiten(weighted_voltage_covariance)).sum(axis=(1, 2))
+    return gains, 0.5 * np.linalg.slogdet(S)[1]
+
+
+class Belief:
     """Covariance of the environment's filter, and the design criteria of each injection.
 
     It is created from the first raw observation of an episode and updated with every later one. The
@@ -97,8 +148,8 @@ class Belief(PolicyBelief):
 
     def _clear_cache(self) -> None:
         self._steps: list[tuple[np.ndarray, ...]] = []
-        vars(self).pop("linearisation", None)
-        vars(self).pop("_weight", None)
+        for cached in ("linearisation", "_weight", "_noise_variance"):
+            vars(self).pop(cached, None)
 
     @property
     def _state(self) -> np.ndarray:
@@ -270,22 +321,66 @@ class Belief(PolicyBelief):
         half = self._by_state(state, self._shared.weight[None])[0]
         return self._by_state(state, half.T[None])[0]
 
-    @property
+    @cached_property
     def _noise_variance(self) -> np.ndarray:
-        return _noise_variance(self.rules, self.linearisation.resistance.tobytes())
+        """(pairs, L) noise variance of the voltages of each pair, per current squared."""
+        i, j = self.rules.pairs.T
+        R = self.linearisation.resistance
+        voltages = self.rules.amplitude * (R[i] - R[j])
+        std = self._filters.table.noise_std(voltages, self.rules.instrument.noise_floor)
+        return np.square(std / self.rules.amplitude)
 
 
-def belief_class(rules: Rules) -> type[Belief] | type[BodyBelief]:
-    """Return the class of a policy's belief for these rules."""
-    return BodyBelief if rules.tracks_body else Belief
+class BodyBelief:
+    """Particles of the environment's filter, and the design criteria of each injection.
 
+    It is created from the first raw observation of an episode and updated with every later one.
+    """
 
-@lru_cache(maxsize=64)
-def _noise_variance(rules: Rules, resistance: bytes) -> np.ndarray:
-    """Return the noise variance (pairs, L) of the voltages of each pair, per current squared."""
-    i, j = rules.pairs.T
-    R = np.frombuffer(resistance).reshape(rules.pairs.max() + 1, -1)
-    table = linearisation_table(rules.world)
-    std = [table.noise_std(rules.amplitude * column, rules.instrument.noise_floor)
-           for column in R[i] - R[j]]
-    return (np.array(std) / rules.amplitude)**2
+    def __init__(self, rules: Rules, observation: dict[str, np.ndarray]) -> None:
+        self.rules = rules
+        self._filters = BodyFilters(rules, observation["frame"][None])
+        model = self._filters.filter.model
+        entries, number = symmetric_entries(len(model.resistance))
+        signals = rules.amplitude * model.signals[entries]
+        self._functionals = np.vstack([signals, self._filters.patches.toarray()]).T.copy()
+        """(G, N + patches) entries of 𝓡 and patches, of a body at each grid point"""
+        currents = rules.action_currents[:len(rules.pairs)]
+        electrodes, measured = measured_first(rules.instrument.measurement_mask(currents))
+        std = np.take_along_axis(model.noise_std(currents @ model.resistance), electrodes, axis=1)
+        self._variance = np.where(measured, std**2, np.inf)
+        self._entries = number[rules.pairs.T[:, :, None], electrodes]
+
+    def update(self, observation: dict[str, np.ndarray]) -> None:
+        """Assimilate the outcome of the last injection."""
+        self._filters.assimilate(observation["voltages"][None], observation["currents"][None])
+
+    def criteria(self, centre: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
+        """Return the A- and D-criterion of each pair, (pairs,) each, of the next injection.
+
+        They treat particles and voltages as jointly Gaussian: the decrease of the expected squared
+        error of the image on the coarse grid, and half of the decrease of the log-determinant of
+        the voltages' covariance. For oracles, ``centre`` (2,) in m is the true position of a
+        present body, to which the mean of the predicted particles is moved.
+        """
+        model = self._filters.filter.model
+        weights = self._filters.filter.weights[0]
+        # the random numbers of the filter's next step are not known
+        particles = model.move(self._filters.filter.particles, np.random.default_rng(1))
+        if centre is not None:
+            moved = particles.centres + centre - weights @ particles.centres[0]
+            particles = particles._replace(centres=reflect(moved, moved, model.limit)[0],
+                                           present=np.ones_like(particles.present))
+        index, shares = model.cells(particles)
+        cells = sp.csr_array((shares.ravel(), index.ravel(), np.arange(0, index.size + 1, 4)),
+                             shape=(len(weights), len(self._functionals)))
+        functionals = cells @ self._functionals
+        mean = weights @ functionals
+        deviation = functionals - mean
+        covariance = deviation.T @ (weights[:, None] * deviation)
+        i, j = self._entries
+        variance = np.diagonal(covariance)
+        square = variance[i] + variance[j] - 2.0 * covariance[i, j] + (mean[i] - mean[j])**2
+        cross = covariance[:, -self._filters.patches.shape[0]:]
+        return pair_design_criteria(covariance, cross @ cross.T, self._entries,
+                                    self._variance + SIGNAL_ERROR**2 * square)

@@ -28,7 +28,7 @@ class BodyFilters(EpisodeFilters):
         self.filter = BodyParticleFilter(body_model(self.table.task), episodes, self.n_particles)
         self.patches = body_patches(self._rules.world.fault_free)
 
-    def assimilate(self, voltages: np.ndarray,
+    def _condition(self, voltages: np.ndarray,
                    currents: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         measured = self._rules.instrument.measurement_mask(currents)
         innovations = self.filter.assimilate(voltages, currents, measured)

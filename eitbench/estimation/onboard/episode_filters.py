@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple, Protocol
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from eitbench.data.episode_cache import score_mass, step_error
-from eitbench.estimation.onboard.linearisation import LinearisationTable, linearisation_table
+from eitbench.estimation.onboard.linearisation import linearisation_table
 
 if TYPE_CHECKING:
     from eitbench.estimation.onboard.rules import Rules
@@ -16,6 +16,8 @@ if TYPE_CHECKING:
 BODY = ("x, m", "y, m", "velocity x, m/s", "velocity y, m/s", "std of x, m", "std of y, m",
         "correlation of x and y", "area relative to the mean", "probability of presence")
 """Estimate of a body, given that it is present."""
+FAULT_EMA_WEIGHT = 0.2
+"""Weight of the last injection in the moving average of the fraction of rejected measurements."""
 
 
 class Innovation(NamedTuple):
@@ -36,8 +38,9 @@ class Innovation(NamedTuple):
         return cls(value[accepted], covariance[np.ix_(accepted, accepted)])
 
 
-class EpisodeFilters(Protocol):
-    """Filters of B episodes, which start at t = 0 with c_ref of the first frame.
+class EpisodeFilters:
+    """Filters of B episodes, which start at t = 0 with c_ref of the first frame, and the fault
+    scores of their electrodes.
 
     Parameters
     ----------
@@ -46,21 +49,19 @@ class EpisodeFilters(Protocol):
         Voltages in V of the first frame, the world's cycle.
     """
 
-    c_ref: np.ndarray
-    """(B,) ĉ_bh in mol/m³"""
-    _rules: Rules
-    table: LinearisationTable
-    indices: list[int]
-    """indices of c_ref in the table"""
-
     def __init__(self, rules: Rules, frames: np.ndarray) -> None:
         self._rules = rules
         self.table = linearisation_table(rules.world)
         self.indices = self._reference_indices(frames)
+        """indices of c_ref in the table"""
         self.c_ref = np.array([self.table.c_ref(k) for k in self.indices])
-        self._start(len(frames))
+        """(B,) ĉ_bh in mol/m³"""
+        B, _, L = frames.shape
+        self._start(B)
         for k, currents in enumerate(rules.world.currents):
-            self.assimilate(frames[:, k], np.repeat(currents[None], len(frames), axis=0))
+            self._condition(frames[:, k], np.repeat(currents[None], B, axis=0))
+        self._innovations = np.zeros((B, L))
+        self._doubt = np.zeros((B, 2, L))
 
     def _reference_indices(self, frames: np.ndarray) -> list[int]:
         """Return the index of c_ref of each episode in the table, from the first frame."""
@@ -68,19 +69,49 @@ class EpisodeFilters(Protocol):
 
     def _start(self, episodes: int) -> None:
         """Create the filters at t = 0."""
+        raise NotImplementedError
 
-    def assimilate(self, voltages: np.ndarray,
+    def assimilate(self, voltages: np.ndarray, currents: np.ndarray) -> None:
+        """Predict and condition on voltages (B, L) in V for currents (B, L) in A (A/m in 2D), all
+        zero without an injection."""
+        self._innovations, accepted = self._condition(voltages, currents)
+        # Fault scores of each electrode: moving averages of the fraction of rejected measurements
+        # at it, and of failed injections through it.
+        reading = self._doubt[:, 0]
+        driving = self._doubt[:, 1]
+        injected = currents.any(axis=1, keepdims=True)
+        failed = ~accepted.any(axis=1, keepdims=True)
+        # A failed injection has no information on the measuring electrodes.
+        reading += FAULT_EMA_WEIGHT * (injected & ~failed) * (~accepted - reading)
+        driving += FAULT_EMA_WEIGHT * (currents != 0.0) * (failed - driving)
+
+    def _condition(self, voltages: np.ndarray,
                    currents: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Predict and condition on voltages (B, L) in V for currents (B, L), all zero without an
-        injection; return the innovations in predicted standard deviations and the mask of accepted
-        measurements, both (B, L)."""
+        """Predict and condition as `assimilate` does; return the innovations in predicted standard
+        deviations and the mask of accepted measurements, both (B, L)."""
+        raise NotImplementedError
+
+    def features(self) -> dict[str, np.ndarray]:
+        """Return innovations (B, L) in predicted standard deviations, mean and std (B, patches) in
+        mol/m³, the fault scores doubt (B, 2, L), and, if estimated, velocity and its std in m/s, or
+        `BODY`."""
+        mean, std = self.coarse_grid()
+        shown = {"innovations": self._innovations.copy(), "mean": mean, "std": std,
+                 "doubt": self._doubt.copy()}
+        if (flow := self.velocity()) is not None:
+            shown |= {"velocity": flow[0], "velocity_std": flow[1]}
+        if (body := self.body()) is not None:
+            shown["body"] = body
+        return shown
 
     def innovations(self) -> list[Innovation | None]:
         """Return the last innovation of each episode, for scores; None without an injection or an
         accepted measurement."""
+        raise NotImplementedError
 
     def coarse_grid(self) -> tuple[np.ndarray, np.ndarray]:
         """Return mean and standard deviation (B, patches) in mol/m³ on the coarse grid."""
+        raise NotImplementedError
 
     def errors(self, moments: np.ndarray, deviations: np.ndarray,
                squares: np.ndarray) -> np.ndarray:
@@ -92,9 +123,11 @@ class EpisodeFilters(Protocol):
 
     def means(self) -> np.ndarray:
         """Return estimates (B, n) in mol/m³ on the task's mesh."""
+        raise NotImplementedError
 
     def stds(self) -> np.ndarray:
         """Return standard deviations (B, n) of the estimates in mol/m³."""
+        raise NotImplementedError
 
     def velocity(self) -> tuple[np.ndarray, np.ndarray] | None:
         """Return velocity parameters θ and their standard deviations (B, k) in m/s; None if the

@@ -1,4 +1,5 @@
-"""Full filters of the episodes of an injection environment, for scored runs."""
+"""Full filters of the episodes of an injection environment, for scored runs, and the choice among
+all filters."""
 
 from __future__ import annotations
 
@@ -7,21 +8,25 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from eitbench import _check
 from eitbench.estimation.filter import Filter, StateSpace, Step
 from eitbench.estimation.gaussian import LinearMeasurement
 from eitbench.estimation.inflow_window import InflowWindow
 from eitbench.estimation.nodal import nodal_states
+from eitbench.estimation.onboard.body_filters import BodyFilters, FullBodyFilters
 from eitbench.estimation.onboard.episode_filters import EpisodeFilters, Innovation
 from eitbench.estimation.onboard.inflow_states import fit_world_prior
 from eitbench.estimation.onboard.linearisation import linearisation_table, std_from_variance
-from eitbench.estimation.velocity import velocity_states
+from eitbench.estimation.onboard.models import VELOCITY_BOUNDS
+from eitbench.estimation.onboard.reduced_filters import ReducedFilters
+from eitbench.estimation.velocity import VelocityStates, task_velocity_prior
 
 if TYPE_CHECKING:
+    from eitbench.estimation.onboard.rules import Rules
     from eitbench.worlds.world import World
 
-VELOCITY_BOUNDS = (1 / 3, 2.0)
-"""Bounds of the mean velocity, relative to the nominal one; narrower than in the built-in methods,
-so that a table of few velocities serves the reduced filter."""
+ESTIMATOR_OPTIONS = ("reduced", "full", "none")
+"""Reduced filter for training, full filter for scores, or no filter."""
 
 
 class FullFilters(EpisodeFilters):
@@ -37,7 +42,7 @@ class FullFilters(EpisodeFilters):
         self._filters = [Filter(space, gate=rules.gate) for _ in range(episodes)]
         self._last: list[Step | None] = [None] * episodes
 
-    def assimilate(self, voltages: np.ndarray,
+    def _condition(self, voltages: np.ndarray,
                    currents: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         innovations = np.zeros_like(voltages)
         accepted = np.ones(voltages.shape, dtype=bool)
@@ -103,4 +108,22 @@ def state_space(world: World, inflow: str) -> StateSpace:
         return InflowWindow(task, fit_world_prior(world), 1.0)
     if task.velocity is None:
         return nodal_states(task.transport, task.prior, 1.0)
-    return velocity_states(task, 1.0, VELOCITY_BOUNDS)
+    return VelocityStates(task, 1.0, task_velocity_prior(task, VELOCITY_BOUNDS))
+
+
+def filters_class(rules: Rules, estimator: str) -> type[EpisodeFilters] | None:
+    """Return the filters' class for one of `ESTIMATOR_OPTIONS`, None for "none". ``ValueError`` for
+    another option, or if the rules have a learned inflow that the world does not permit."""
+    _check.choice("estimator", estimator, ESTIMATOR_OPTIONS)
+    if estimator == "none":
+        return None
+    if rules.inflow == "learned":
+        if not hasattr(rules.world.target, "draw_inflow"):
+            raise ValueError("inflow must be 'white' for a target without inflow, got 'learned' "
+                             f"for the target {type(rules.world.target).__name__}")
+        if rules.world.velocity_model is not None:
+            raise ValueError("inflow must be 'white' where the velocity is estimated too, "
+                             f"got {rules.inflow!r}")
+    if rules.tracks_body:
+        return BodyFilters if estimator == "reduced" else FullBodyFilters
+    return ReducedFilters if estimator == "reduced" else FullFilters

@@ -12,8 +12,7 @@ from eitbench._notice import notify
 from eitbench.data.cache import Key, cached, config_dict, model_key
 from eitbench.estimation.covariance import LowRankCovariance, OpenLoopCovariance
 from eitbench.estimation.filter import Filter
-from eitbench.estimation.forward import LinearisedForwardModel
-from eitbench.estimation.gaussian import LinearMeasurement
+from eitbench.estimation.gaussian import LinearisedForwardModel, LinearMeasurement
 from eitbench.estimation.inflow_response import steady_response
 from eitbench.estimation.nodal import (
     FILTER_RANK_TOLERANCE,
@@ -22,25 +21,27 @@ from eitbench.estimation.nodal import (
     initial_covariance,
     nodal_filter,
 )
-from eitbench.estimation.onboard.full_filters import VELOCITY_BOUNDS
 from eitbench.estimation.onboard.inflow_states import (
     InflowModel,
     InflowStates,
+    NodeVoltages,
     fit_world_prior,
     inflow_model,
+    node_voltages,
     sample_coordinates,
 )
 from eitbench.estimation.onboard.linearisation import pair_currents
-from eitbench.estimation.onboard.node_voltages import NodeVoltages, node_voltages
 from eitbench.estimation.reduced import (
+    JointModel,
+    JointStates,
     ReducedModel,
     ReducedStates,
     SteadyStates,
     covariance_reduction,
     dominant_directions,
+    joint_model,
     reduced_model,
 )
-from eitbench.estimation.reduced_joint import JointModel, JointStates, joint_model
 from eitbench.numerics.fem import mass_matrix
 from eitbench.worlds.task import make_task
 
@@ -49,6 +50,9 @@ if TYPE_CHECKING:
     from eitbench.worlds.task import Task
     from eitbench.worlds.world import World
 
+VELOCITY_BOUNDS = (1 / 3, 2.0)
+"""Bounds of the mean velocity, relative to the nominal one; narrower than in the built-in methods,
+so that a table of few velocities serves the reduced filter."""
 WHITE_INFLOW_RANK = 120
 """Coordinates of the concentration with a white inflow."""
 WHITE_MODEL_VERSION = 1

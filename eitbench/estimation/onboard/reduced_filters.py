@@ -33,7 +33,7 @@ class ReducedFilters(EpisodeFilters):
         self.shared = SharedData.of(self._rules)
         self.filter = ReducedFilter(self.shared.single, episodes)
 
-    def assimilate(self, voltages: np.ndarray,
+    def _condition(self, voltages: np.ndarray,
                    currents: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         self.filter.predict()
         states = self.shared.single
