@@ -15,12 +15,7 @@ from eitbench.worlds.fields import check_positive
 from eitbench.worlds.instrument import Instrument
 from eitbench.worlds.random_streams import EpisodeStreams, episode_streams
 from eitbench.worlds.schedule import Schedule
-from eitbench.worlds.stored_names import (
-    WORLD_MEMBERS,
-    add_current_members,
-    current_field_name,
-    warn_renamed,
-)
+from eitbench.worlds.stored_names import add_current_members
 
 if TYPE_CHECKING:
     from eitbench.numerics.mesh import Mesh
@@ -369,13 +364,6 @@ class World:
                                        1e-2 * self.expected_concentration)
         return Discretisation(transport, observation)
 
-    def __getattr__(self, name: str) -> Any:
-        """Return a member by its earlier name."""
-        if name not in WORLD_MEMBERS:
-            raise AttributeError(f"World has no attribute {name!r}")
-        warn_renamed(name, WORLD_MEMBERS[name])
-        return getattr(self, WORLD_MEMBERS[name])
-
     def __hash__(self) -> int:
         return self._hash
 
@@ -446,8 +434,7 @@ def _changed(part: Any, changes: Mapping[str, Any], where: str) -> Any:
     if isinstance(part, World):
         known.remove("name")
     made: dict[str, Any] = {}
-    for given, value in changes.items():
-        name = current_field_name(given, known)
+    for name, value in changes.items():
         if name not in known:
             raise ValueError(f"{where} has no {name!r}; there are {', '.join(known)}"
                              + _check.did_you_mean(name, known))

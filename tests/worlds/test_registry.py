@@ -80,7 +80,7 @@ def test_an_id_belongs_to_one_world():
     """Equal registrations are accepted; another world, track, setting or text under the id is rejected."""
     register(QUIET, ID, lag=1)
     register(replace(QUIET), ID, lag=1)
-    for world, settings in ((OTHER, {"lag": 1}), (QUIET, {}), (QUIET, {"lag": 1, "about": "!"}),
+    for world, settings in ((OTHER, {"lag": 1}), (QUIET, {}), (QUIET, {"lag": 1, "description": "!"}),
                             (QUIET, {"track": "injection"})):
         with pytest.raises(ValueError, match=f"id {ID} belongs to another world already"):
             register(world, ID, **settings)
