@@ -249,7 +249,8 @@ def resolve_arguments(registered: Entry, changes: dict[str, Any] | None, lag: in
         assumed = registered.settings.get("assume", {})
     if not isinstance(assumed, Mapping):
         raise ValueError(f"assume must be a dict of assumptions on the flow, got {assumed!r}")
-    world.flow.check_assumed(world, dict(assumed))
+    if assumed:
+        world.flow.assumed_velocity(world, **assumed)
     return world, lag_steps(world, lag), dict(assumed)
 
 

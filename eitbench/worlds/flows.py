@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any
@@ -42,9 +42,6 @@ class PipeFlow(Flow):
 
     def nominal(self, world: World, fine: bool) -> VelocityField:
         return world.vessel.laminar_velocity(self.mean_velocity)
-
-    def check_assumed(self, world: World, assumed: Mapping[str, Any]) -> None:
-        self.assumed_velocity(world, **assumed)
 
     def assumed_velocity(self, world: World, **assumed: Any) -> VelocityField:
         """Accept ``mean_velocity`` in m/s and, in a plane pipe, ``profile``, one of `PROFILES`."""
@@ -261,14 +258,12 @@ class FlowPastBulge(PipeFlow):
         """Return the true flow, computed once per process."""
         return _past_bulge(world.vessel, self, (96, 24) if fine else (64, 16))
 
-    def check_assumed(self, world: World, assumed: Mapping[str, Any]) -> None:
+    def assumed_velocity(self, world: World, **assumed: Any) -> VelocityField:
         """Accept ``flow``, one of `BULGE_FLOW_ASSUMPTIONS`."""
         reject_unknown_assumptions(assumed, ("flow",))
-        _check.choice("assume.flow", assumed.get("flow", "parabolic"), BULGE_FLOW_ASSUMPTIONS)
-
-    def assumed_velocity(self, world: World, **assumed: Any) -> VelocityField:
-        self.check_assumed(world, assumed)
-        if assumed.get("flow") == "real":
+        flow = assumed.get("flow", "parabolic")
+        _check.choice("assume.flow", flow, BULGE_FLOW_ASSUMPTIONS)
+        if flow == "real":
             return self.nominal(world, fine=False)
         return LocalParabola(self.mean_velocity, world.vessel.half_width, world.vessel.bulge)
 

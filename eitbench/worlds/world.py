@@ -87,13 +87,10 @@ class Flow(Protocol):
     def nominal(self, world: World, fine: bool) -> VelocityField | None:
         """Return the velocity of the truth (``fine``) or the estimator model; None: no flow."""
 
-    def check_assumed(self, world: World, assumed: Mapping[str, Any]) -> None:
-        """Raise ``ValueError`` if `assumed_velocity` does not accept ``assumed``; cheap."""
-        reject_unknown_assumptions(assumed, ())
-
     def assumed_velocity(self, world: World, **assumed: Any) -> VelocityField | None:
-        """Return the velocity of the estimator model under other assumptions than the default."""
-        self.check_assumed(world, assumed)
+        """Return the velocity of the estimator model under other assumptions than the default;
+        ``ValueError`` for an assumption that it does not accept."""
+        reject_unknown_assumptions(assumed, ())
         return self.nominal(world, fine=False)
 
     def residence_steps(self, world: World) -> int:
