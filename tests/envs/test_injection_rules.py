@@ -115,7 +115,7 @@ def test_a_noise_floor_adds_to_the_noise():
     currents[:2, [0, 5]] = 0.1, -0.1
     draws = rng.normal(size=(3, 16))
     steps = np.arange(1, 4)
-    none = Faults.none(16)
+    none = instrument.draw(rng, 16, 3)
     read = instrument.measure(none, steps, np.repeat(R[None], 3, axis=0), currents, draws)
     clean = currents @ R
     std = np.hypot(instrument.noise.std(clean), 2e-3)
