@@ -210,8 +210,8 @@ class EstimationEnv(EpisodeEnv):
         n_steps = self.world.n_steps
         self.core.load_until(n_steps)
         correct = make_task(self.world, self.lag)
-        transport = self.world.true_transport(
-            Discretisation(correct.transport, correct.observation),
+        transport = self.world.flow.true_transport(
+            self.world, Discretisation(correct.transport, correct.observation),
             episode_streams(self.core.seeds[0]).flow)
         return PrivilegedInfo(self.core.voltages[:n_steps, 0].copy(),
                         self.core.currents[:n_steps].copy(), transport, velocity)

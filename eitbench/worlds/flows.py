@@ -226,7 +226,7 @@ class TurbulentFlow(PipeFlow):
 
     def true_transport(self, world: World, model: Discretisation, random: np.random.Generator,
                        ) -> Callable[[float], Transport]:
-        """See `World.true_transport`; t may be fractional if the model has shorter steps."""
+        """See `Flow.true_transport`; t may be fractional if the model has shorter steps."""
         from eitbench.physics.transport import ConvectionDiffusion
         from eitbench.physics.turbulence import FluctuatingTransport
         assert isinstance(model.transport, ConvectionDiffusion)

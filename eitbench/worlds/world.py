@@ -112,7 +112,11 @@ class Flow(Protocol):
 
     def true_transport(self, world: World, model: Discretisation,
                        random: np.random.Generator) -> Callable[[int], Transport]:
-        """See `World.true_transport`."""
+        """Return t -> an episode's true transport from t − 1 to t, on the mesh of ``model``.
+
+        For oracles. ``model`` is the estimator model without wrong assumptions, ``random`` the
+        unused stream of the episode.
+        """
         drawn = self.draw(world, random)
         if drawn is None:
             return lambda t: model.transport
@@ -300,15 +304,6 @@ class World:
         arguments of `Flow.assumed_velocity`. ``ValueError`` for an unknown one.
         """
         return self._discretise(self.flow.assumed_velocity(self, **assumed), fine=False)
-
-    def true_transport(self, model: Discretisation,
-                       flow: np.random.Generator) -> Callable[[int], Transport]:
-        """Return t -> an episode's true transport from t − 1 to t, on the mesh of ``model``.
-
-        For oracles. ``model`` is the estimator model without wrong assumptions, ``flow`` the
-        unused stream of the episode.
-        """
-        return self.flow.true_transport(self, model, flow)
 
     def true_observation(self, truth: Discretisation,
                          contacts: np.random.Generator) -> ObservationModel:

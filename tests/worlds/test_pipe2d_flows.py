@@ -159,7 +159,7 @@ def test_a_reference_is_given_the_flow_that_carries(world):
     """The true transport is bit-identical to a step on the estimator mesh with the flow drawn for that step."""
     world = world.with_changes(DRAWN)
     model, flow = world.estimator_model(), drawn(world, 7)
-    transport_at = world.true_transport(model, episode_streams(7).flow)
+    transport_at = world.flow.true_transport(world, model, episode_streams(7).flow)
     c = 30.0 + np.random.default_rng(0).normal(size=model.transport.mesh.n_nodes)
     for t in (1, 2, 5):
         real = model.transport.with_velocity(flow(t))

@@ -155,8 +155,9 @@ def test_task_and_oracle():
     assert other.estimator_model().transport.velocity == PowerLawFlow(MEAN, R)
     model = PIPE_2D_TURBULENT.estimator_model()
     assert model.transport.velocity == PlaneChannelFlow(MEAN, R)
-    oracle = PIPE_2D_TURBULENT.true_transport(model, episode_streams(5).flow)(3)
-    drawn = PIPE_2D_TURBULENT.flow.draw(PIPE_2D_TURBULENT, episode_streams(5).flow)
+    flow = PIPE_2D_TURBULENT.flow
+    oracle = flow.true_transport(PIPE_2D_TURBULENT, model, episode_streams(5).flow)(3)
+    drawn = flow.draw(PIPE_2D_TURBULENT, episode_streams(5).flow)
     added = oracle._eddies.velocity(points(0), oracle.begin + oracle.time_step)
     np.testing.assert_allclose(drawn(3)(points(0)), PlaneChannelFlow(MEAN, R)(points(0)) + added, rtol=1e-12)
 
