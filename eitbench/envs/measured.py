@@ -159,7 +159,7 @@ class MeasuredEnv(FixedLengthEnv):
             mask=self.available & ~self.withheld_mask,
             **self._options)
         """information for the agent"""
-        self._full_model = self.model.with_mask(self.available)
+        self._full_model = replace(self.model, mask=self.available)
         self._seed = seed
 
     @property

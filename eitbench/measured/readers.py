@@ -48,13 +48,11 @@ def read(path: Path | str, format: str | None = None, steps: slice | None = None
     _check.choice("format", format, READERS)
     if format == "table" and "electrodes" not in options:
         options = _table_options(path) | options
-    names = set(signature(READERS[format]).parameters) - {"path", "steps"}
+    names = set(signature(READERS[format]).parameters) - {"path"}
     if unknown := sorted(set(options) - names):
-        raise ValueError(f"options of a file of format {format} must be among "
+        raise ValueError(f"options of {path} (format {format}) must be among "
                          f"{', '.join(sorted(names)) or '(none)'}, got {', '.join(unknown)}")
     try:
-        if format == "hdf5" and steps is not None:
-            return Measurements.load(path, steps).select(slice(None))
         measurements = READERS[format](path, **options)
         return measurements if steps is None else measurements.select(steps)
     except ValueError as error:
@@ -294,9 +292,6 @@ def _table_options(table: Path) -> dict[str, Any]:
                          f"16' and 'current: 0.001' (A), got neither {table.name}.yml nor a "
                          f"{table.stem}.yml of a table in the folder of {table}")
     options = load_yaml(path, "table")
-    known = sorted(set(signature(read_table).parameters) - {"path"})
-    for name in options:
-        _check.choice(f"each entry of {path}", name, known)
     if missing := {"electrodes", "current"} - set(options):
         raise ValueError(f"{path} must have {', '.join(sorted(missing))}")
     return options

@@ -12,6 +12,7 @@ from tanks import VESSEL, stationary
 
 from commands import eitbench
 
+pytestmark = pytest.mark.usefixtures("coarse")
 SIDE = ((np.arange(256) + 0.5) / 256 * 2.0 - 1.0) * 0.1
 X, Y = np.meshgrid(SIDE, -SIDE)
 
@@ -51,7 +52,7 @@ def test_equal_segmentations_score_one_and_others_less():
 
 
 @pytest.fixture(scope="module")
-def env():
+def env(coarse):
     return MeasuredEnv(stationary(), VESSEL, initial_std=0.5)
 
 
