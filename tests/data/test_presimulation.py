@@ -22,8 +22,8 @@ from recorded import forget
 from short import DRAWN, PLAIN, shorten
 from tiny_worlds import TINY
 
-SEEDS = range(10)
-"""A full batch of eight and a remainder."""
+SEEDS = range(4)
+"""A full batch of `small_batches` and a remainder."""
 
 
 @pytest.fixture(autouse=True)
@@ -34,6 +34,12 @@ def place(tmp_path, monkeypatch):
     forget()
     yield folder(TINY)
     forget()
+
+
+@pytest.fixture
+def small_batches(monkeypatch):
+    """Simulate three episodes in a batch."""
+    monkeypatch.setattr(presimulation, "BATCH_SIZE", 3)
 
 
 @pytest.fixture(scope="module")
@@ -69,7 +75,7 @@ def test_recordings_have_the_bits_of_those_made_alone(place, alone, monkeypatch,
     """Each cached episode belongs to its seed, and truths are not stored; if $EITBENCH_CACHE changes, existing workers
     use the new folder."""
     get_reusable_executor().shutdown(wait=True)      # workers keep their initial cache folder
-    assert presimulate(TINY, SEEDS, n_jobs=2) == 10
+    assert presimulate(TINY, SEEDS, n_jobs=2) == 4
     assert names(place) == sorted(f"{seed}.npy" for seed in SEEDS)
     monkeypatch.setattr("eitbench.data.episode_cache.simulate", None)               # all are cached
     assert {seed: cached_episode(TINY, seed).tobytes() for seed in SEEDS} == alone
@@ -79,28 +85,28 @@ def test_recordings_have_the_bits_of_those_made_alone(place, alone, monkeypatch,
     assert is_episode_cached(TINY, 0) and is_episode_cached(TINY, 1)
 
 
-def test_only_what_is_missing_is_made(place, asked, alone):
-    """Batches have eight episodes; duplicate seeds are simulated once, a damaged file counts as missing."""
+def test_only_what_is_missing_is_made(place, asked, alone, small_batches):
+    """Batches have a limited size; duplicate seeds are simulated once, a damaged file counts as missing."""
     cached_episode(TINY, 2)
     (place / "2.truth.npy").unlink()
     assert presimulate(TINY, [4, 2, 1, 4]) == 2 and asked == [[4, 1]]
     before = stamps(place)
     assert before.keys() == {"1.npy", "2.npy", "4.npy"}
     assert presimulate(TINY, [1, 2, 4]) == presimulate(TINY, []) == 0 and len(asked) == 1
-    assert presimulate(TINY, range(12)) == 9 and asked[1:] == [[0, 3, 5, 6, 7, 8, 9, 10], [11]]
+    assert presimulate(TINY, range(7)) == 4 and asked[1:] == [[0, 3, 5], [6]]
     assert {name: stamps(place)[name] for name in before} == before
     path = cache.episode_key(TINY, 1).path
     path.write_bytes(path.read_bytes()[:-1])
-    assert presimulate(TINY, range(12)) == 1 and asked[3:] == [[1]]
+    assert presimulate(TINY, range(7)) == 1 and asked[3:] == [[1]]
     assert {seed: cached_episode(TINY, seed).tobytes() for seed in SEEDS} == alone
 
 
-def test_interrupted_fill_keeps_what_is_done_and_resumes(place, asked, alone, monkeypatch):
-    """After Ctrl-C at the third episode, three are cached and valid, and the next call simulates the other seven."""
+def test_interrupted_fill_keeps_what_is_done_and_resumes(place, asked, alone, small_batches, monkeypatch):
+    """After Ctrl-C at the third episode, two are cached and valid, and the next call simulates the other two."""
     real = cache.store
 
     def interrupted(key, arrays):
-        if len(names(place)) == 3:
+        if len(names(place)) == 2:
             raise KeyboardInterrupt
         real(key, arrays)
 
@@ -110,9 +116,9 @@ def test_interrupted_fill_keeps_what_is_done_and_resumes(place, asked, alone, mo
         with pytest.raises(KeyboardInterrupt):
             presimulate(TINY, SEEDS)
     forget()
-    assert [seed for seed in SEEDS if is_episode_cached(TINY, seed)] == [0, 1, 2]
+    assert [seed for seed in SEEDS if is_episode_cached(TINY, seed)] == [0, 1]
     before = stamps(place)
-    assert presimulate(TINY, SEEDS) == 7 and asked[1] == [3, 4, 5, 6, 7, 8, 9]
+    assert presimulate(TINY, SEEDS) == 2 and asked[1] == [2, 3]
     assert {name: stamp for name, stamp in stamps(place).items() if name in before} == before
     assert {seed: cached_episode(TINY, seed).tobytes() for seed in SEEDS} == alone
 
