@@ -210,19 +210,16 @@ class Cylinders(Body):
 
     def __post_init__(self) -> None:
         check_positive(self, background="mol/m³", concentration_ratio="", min_gap="m")
+        check_range(self, "large_radius", "m")
+        check_range(self, "small_radius", "m")
 
     def check(self, world: World) -> None:
         """Raise ``ValueError`` if the cylinders do not fit into the vessel."""
         tank = world.vessel.radius
-        for name in ("large_radius", "small_radius"):
-            given = getattr(self, name)
-            low, high = _check.array(f"target.{name}", given, (2,), units="m")
-            if not 0 < low <= high < 0.3 * tank:
-                raise ValueError(f"target.{name} must be a range 0 < low ≤ high < 0.3·radius in m, "
-                                 f"got {given!r}")
-        if self.small_radius[1] > self.large_radius[1]:
-            raise ValueError("target.small_radius must not reach beyond large_radius, got "
-                             f"{self.small_radius!r} and {self.large_radius!r} m")
+        if not self.small_radius[1] <= self.large_radius[1] < 0.3 * tank:
+            raise ValueError("target.small_radius must not reach beyond large_radius, nor this "
+                             f"beyond {0.3 * tank:g} m, got {self.small_radius!r} and "
+                             f"{self.large_radius!r} m")
         _check.integer("vessel.n_electrodes", world.vessel.n_electrodes, low=8)
         inside = 1.0 - self.large_radius[1] / tank
         _check.number("target.max_centre_radius", self.max_centre_radius, low=0.5, high=inside)

@@ -32,9 +32,9 @@ from eitbench.worlds.slugs import DeadTimePoissonArrivals, Slugs
 from eitbench.worlds.vessels import Bulge, PlanePipe, RoundPipe, RoundTank
 from eitbench.worlds.world import Prior, World
 
-PAGES = dict(re.findall(r"^# (\S+)\n\n(.*?)(?=\n+^# |\n\Z)",
-                        Path(__file__).with_name("pages.md").read_text(encoding="utf-8"),
-                        re.MULTILINE | re.DOTALL))
+_, *PARTS = re.split(r"^# (.+)$", flags=re.MULTILINE,
+                     string=Path(__file__).with_name("pages.md").read_text(encoding="utf-8"))
+PAGES = dict(zip(PARTS[::2], map(str.strip, PARTS[1::2]), strict=True))
 """Id -> its description, and name -> text that descriptions share."""
 
 
