@@ -14,6 +14,7 @@ from eitbench import _check
 from eitbench.physics.flow import PlaneChannelFlow, PlugFlow, PowerLawFlow
 from eitbench.physics.profiles import SkewedChannelFlow, VelocityModel, parabolic_model
 from eitbench.worlds.fields import check_positive, check_range
+from eitbench.worlds.task import make_task
 from eitbench.worlds.vessels import Bulge, PlanePipe
 from eitbench.worlds.world import Discretisation, Flow, World, reject_unknown_assumptions
 
@@ -269,7 +270,7 @@ class FlowPastBulge(PipeFlow):
 
     def true_transport(self, world: World, model: Discretisation, random: np.random.Generator,
                        ) -> Callable[[int], Transport]:
-        real = _real_model(world).transport
+        real = make_task(world, flow="real").transport
         return lambda t: real
 
 
@@ -343,12 +344,6 @@ class LocalParabola:
 def transit_steps(world: World, velocity: float) -> int:
     """Return the time steps in which fluid with this velocity in m/s passes the pipe."""
     return math.ceil(world.vessel.length / (velocity * world.time_step))
-
-
-@lru_cache(maxsize=1)
-def _real_model(world: World) -> Discretisation:
-    """Return one model per process: filters cache derived matrices by transport model."""
-    return world.estimator_model(flow="real")
 
 
 @lru_cache(maxsize=4)
