@@ -108,9 +108,9 @@ class MeasuredEnv(FixedLengthEnv):
                                    voltages=np.where(spikes, np.nan, measurements.voltages))
         self.measurements = measurements
         T, (M, L) = len(measurements.injection_index), measurements.matrix.shape
-        if self.vessel.n_electrodes != L:
+        if (count := self.vessel.shape.n_electrodes) != L:
             raise ValueError(f"vessel must have the {L} electrodes of the measurements, got "
-                             f"{self.vessel.n_electrodes}")
+                             f"{count}")
         self.withheld = _check.number("withheld", withheld, low=0.0, high=0.5)
         reference = measurements.reference_frames(homogeneous_frames)
         self._electrodes = self.vessel.electrode_model(INITIAL_CONTACT_IMPEDANCE)

@@ -81,11 +81,6 @@ class VesselConfig:
             raise ValueError("flow.velocity_std must be 0 in a cylinder, whose velocity is not "
                              f"estimated, got {self.flow.velocity_std:g}")
 
-    @property
-    def n_electrodes(self) -> int:
-        """Number of electrodes L."""
-        return self.shape.n_electrodes
-
     def transport_mesh(self) -> Mesh:
         """Return the mesh of the estimates, the same object for equal vessels."""
         return _transport_mesh(self.shape, self.first_electrode_deg, self.direction)

@@ -97,7 +97,7 @@ def test_command_scores_by_a_ground_truth(tmp_path):
     savemat(tmp_path / "truth.mat", {"truth": disk(0.05, 0.0, 0.02, 1)})
     (tmp_path / "tank.yml").write_text(yaml.safe_dump(VESSEL))
     arguments = ["estimate", tmp_path / "still.h5", "--baseline", "homogeneous", "--truth", tmp_path / "truth.mat",
-             "--vessel", tmp_path / "tank.yml", "--out", tmp_path / "page.html"]
+             "--still", "--vessel", tmp_path / "tank.yml", "--out", tmp_path / "page.html"]
     code, output, err = eitbench(*arguments)
     assert code == 0, err
     assert "KTC score" in output
