@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from eitbench.envs.measured import MeasuredEnv
 from eitbench.measured import Measurements, read
-from tanks import FIXED_STDS, VESSEL, moving
+from tanks import VESSEL, moving
 
 pytestmark = pytest.mark.usefixtures("coarse")
 PAIR = np.array([[1.0, -1.0, 0.0], [0.0, 1.0, -1.0]])
@@ -106,7 +106,7 @@ def test_large_files_are_memory_mapped(tmp_path, monkeypatch):
 
     def first_step(path):
         tracemalloc.start()
-        env = MeasuredEnv(path, VESSEL, **FIXED_STDS)
+        env = MeasuredEnv(path, VESSEL, moves=False, initial_std=0.2)
         observation, _ = env.reset(seed=0)
         env.step(np.full(env.task.mesh.n_nodes, env.task.expected_concentration))
         peak = tracemalloc.get_traced_memory()[1]
