@@ -133,8 +133,12 @@ def read_case(name: Path | str) -> MeasuredCase:
     with require_extra("the YAML file of a case"):
         import jsonschema_rs
     schema = jsonschema_rs.validator_for(json.loads(SCHEMA.read_text(encoding="utf-8")))
-    if wrong := [f"{'.'.join(['case', *map(str, error.instance_path)])}: {error.message}"
-                 for error in schema.iter_errors(entries)]:
+    try:
+        wrong = [f"{'.'.join(['case', *map(str, error.instance_path)])}: {error.message}"
+                 for error in schema.iter_errors(entries)]
+    except ValueError as error:                         # a date, or a name that is not a text
+        wrong = [f"case: {error}"]
+    if wrong:
         raise ValueError(f"{path}: {'; '.join(wrong)}")
     fixed = {each.name: entries.pop(each.name) for each in fields(MeasuredCase)
              if each.name in entries}

@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from datetime import date
 
 import gymnasium as gym
 import numpy as np
@@ -90,7 +91,7 @@ def test_a_span_changes_the_digest(folder):
 
 @pytest.mark.parametrize(("change", "message"), [
     ({"licence": ""}, "case.licence"), ({"sha256": "abc"}, "case.sha256"), ({"vessel": 3}, "case.vessel"),
-    ({"frames": 3}, "case: .*'frames' was unexpected"),
+    ({"title": date(2023, 1, 1)}, r"a\.yml: case: Unsupported type: 'date'"), ({"frames": 3}, "case: .*'frames' was unexpected"),
     ({"auxiliary_files": {"ref.mat": "1"}}, "case.auxiliary_files.ref.mat"),
     ({"span": "0:800"}, r"case\.span")])
 def test_invalid_entries_are_named(folder, change, message):
