@@ -24,7 +24,7 @@ from eitbench.measured.readers import load_yaml, read
 from eitbench.measured.segmentation import read_truth
 
 CASES = Path(__file__).with_name("cases")
-SCHEMA = Path(__file__).with_name("case_schema.json")
+CASE_SCHEMA = Path(__file__).with_name("case_schema.json")
 """JSON schema of the entries of a case."""
 WITHHELD_FRACTION = 0.1
 """Fraction of the measurements that scores methods."""
@@ -132,7 +132,7 @@ def read_case(name: Path | str) -> MeasuredCase:
     entries = load_yaml(path, "case")
     with require_extra("the YAML file of a case"):
         import jsonschema_rs
-    schema = jsonschema_rs.validator_for(json.loads(SCHEMA.read_text(encoding="utf-8")))
+    schema = jsonschema_rs.validator_for(json.loads(CASE_SCHEMA.read_text(encoding="utf-8")))
     try:
         wrong = [f"{'.'.join(['case', *map(str, error.instance_path)])}: {error.message}"
                  for error in schema.iter_errors(entries)]

@@ -83,7 +83,7 @@ def pipe():
 
 
 def test_a_filter_with_the_flow_predicts_better(pipe):
-    """Nodes of the task and a transport step equal those of the world."""
+    """The nodes and a transport step of the task are as in the world."""
     env = MeasuredEnv(pipe, SMALL_PIPE | {"flow": {"mean_velocity": 4.5}})
     rmse = [run_on_measurements(env, name).withheld_rmse for name in ("log_inflow_filter", "homogeneous")]
     assert rmse[0] < rmse[1] / 3
