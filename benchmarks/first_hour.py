@@ -21,9 +21,9 @@ from eitbench.bench.tracks import builtin_ids
 OBSERVATION = "import sys, gymnasium, eitbench\ngymnasium.make(sys.argv[1]).reset()"
 RECORD = """
 import sys
-from eitbench.data.presimulation import presimulate_inline
+from eitbench.data.presimulation import presimulate
 from eitbench.worlds.registry import entry
-presimulate_inline(entry(sys.argv[1]).world, range(int(sys.argv[2])))
+presimulate(entry(sys.argv[1]).world, range(int(sys.argv[2])))
 """
 FRAMES = 20_000
 """Number of training frames of PPO."""

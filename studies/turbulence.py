@@ -31,7 +31,7 @@ TARGET = (Path(__file__).resolve().parent.parent / "baselines" / "models" / "tur
 
 def flow_errors(world, model, seed: int) -> np.ndarray:
     """Return d (T, n) of an episode, t = 1 … T, relative to the background."""
-    transport_at = world.true_transport(model, episode_streams(seed).flow)
+    transport_at = world.flow.true_transport(world, model, episode_streams(seed).flow)
     inflow = world.sample_inflow(seed)
     true = mean = np.full(model.transport.mesh.n_nodes, world.background)
     errors = []

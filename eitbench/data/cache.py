@@ -68,10 +68,11 @@ class File(NamedTuple):
     build: Callable[[], Arrays]
 
 
-def episode_key(world: World, name: str) -> Key:
-    """Return the key of arrays that depend on `World.truth_config` and, by ``name``, on a seed."""
+def episode_key(world: World, name: int | str) -> Key:
+    """Return the key of arrays that depend on `World.truth_config` and on a seed: a cached episode,
+    or with the ``name`` SEED.truth its truth."""
     config = world.truth_config
-    return Key(f"{config.name}-{world_digest(config)[:16]}", name)
+    return Key(f"{config.name}-{world_digest(config)[:16]}", str(name))
 
 
 def model_key(name: str, configuration: Any, version: int) -> Key:

@@ -20,7 +20,6 @@ from scipy.sparse.linalg import splu
 from tqdm import tqdm
 
 from eitbench import _check
-from eitbench._extras import require_extra
 from eitbench.data.episode_cache import (
     cached_episode,
     cycle_voltages,
@@ -29,7 +28,7 @@ from eitbench.data.episode_cache import (
     scoring_constants,
 )
 from eitbench.data.episodes import cache_per_truth
-from eitbench.data.presimulation import BATCH_SIZE, presimulate_inline
+from eitbench.data.presimulation import BATCH_SIZE, presimulate
 from eitbench.data.seeds import format_seed, is_test, parse_seeds
 from eitbench.worlds.registry import entry
 from eitbench.worlds.world import World
@@ -69,7 +68,8 @@ class Dataset:
     """Examples of a world in the order of their seeds; see `dataset`.
 
     Iteration loads one example at a time. Missing episodes are simulated in batches of eight and
-    cached; `eitbench bank` simulates them in advance, in several processes.
+    cached; `eitbench bank` simulates them in advance, in several processes. ``DataLoader`` of torch
+    accepts it as a map-style data set.
     """
 
     env: str
@@ -87,7 +87,7 @@ class Dataset:
     def __iter__(self) -> Iterator[Example]:
         for k in range(0, len(self.seeds), BATCH_SIZE):
             group = self.seeds[k:k + BATCH_SIZE]
-            presimulate_inline(self.world, group)
+            presimulate(self.world, group, show_steps=True)
             yield from map(self.example, group)
 
     def __getitem__(self, index: int) -> Example:
@@ -162,10 +162,8 @@ class Dataset:
         basis = _check.array("basis", basis, (n, None), units="mol/m³")
         if mean is None:
             mean = self.world.background
-        elif np.ndim(mean):
-            mean = _check.array("mean", mean, (n,), units="mol/m³")
         else:
-            _check.number("mean", mean, units="mol/m³")
+            mean = _check.array("mean", mean, (n,) if np.ndim(mean) else (), units="mol/m³")
         reduced = Dataset(self.env, self.world, self.seeds, basis, mean)
         squares = np.linalg.eigvalsh(reduced.mass)
         if not squares[0] > RANK_TOLERANCE * squares[-1]:
@@ -177,15 +175,6 @@ class Dataset:
         """Return mol/m³ (..., n) of coordinates (..., q)."""
         found: np.ndarray = self.mean + coordinates @ self._columns.T
         return found
-
-    def torch(self) -> TorchDataset:
-        """Return a map-style dataset for torch; ``ModuleNotFoundError`` without torch.
-
-        Missing episodes are simulated one by one; `eitbench bank` is faster.
-        """
-        with require_extra("a dataset for torch"):
-            import torch  # noqa: F401
-        return TorchDataset(self)
 
     @cached_property
     def _nodal_mass(self) -> sp.csr_array:
@@ -200,23 +189,6 @@ class Dataset:
     @cached_property
     def _weighted(self) -> np.ndarray:
         return np.asarray(self._nodal_mass @ self._columns)
-
-
-class TorchDataset:
-    """A map-style dataset of the fields of each `Example` as single-precision tensors."""
-
-    def __init__(self, examples: Dataset) -> None:
-        self.examples = examples
-
-    def __len__(self) -> int:
-        return len(self.examples)
-
-    def __getitem__(self, index: int) -> dict[str, Any]:
-        import torch
-        fields = self.examples[index]._asdict()
-        seed = torch.tensor(fields.pop("seed"))
-        return {"seed": seed} | {name: torch.from_numpy(np.array(field, dtype=np.float32))
-                                 for name, field in fields.items()}
 
 
 def dataset(env: str, seeds: str | Sequence[int], *,

@@ -23,7 +23,6 @@ from eitbench.data.episodes import (
     Episode,
     cache_per_truth,
     cached_truth_model,
-    is_simulated,
     simulate,
     simulate_batch,
 )
@@ -91,7 +90,7 @@ def cached_episode(world: World, seed: int) -> np.ndarray:
     def build() -> dict[str, np.ndarray]:
         return {"steps": build_cached_episode(world, simulate(world, seed))}
 
-    return cache.cached(cached_episode_key(world, seed), build)["steps"]
+    return cache.cached(cache.episode_key(world, seed), build)["steps"]
 
 
 def cached_episode_prefix(world: World, seed: int, needed: int) -> np.ndarray:
@@ -110,7 +109,8 @@ def concentration_at(world: World, seed: int, t: int, needed: int) -> np.ndarray
     """Return c_t (n_truth,) in mol/m³ on the truth's mesh; ``needed`` steps are simulated as in
     `cached_episode_prefix`."""
     last = needed + EXTRA_STEPS
-    is_early = t <= last < world.n_steps and not is_simulated(world, seed)
+    is_simulated = cache.episode_key(world, f"{seed}.truth").path.is_file()
+    is_early = t <= last < world.n_steps and not is_simulated
     episode = _prefix(world.truth_config, seed, last) if is_early else simulate(world, seed)
     return episode.concentration[t].astype(float)
 
@@ -120,14 +120,9 @@ def _prefix(config: World, seed: int, last: int) -> Episode:
     return next(simulate_batch(config, [seed], last=last))
 
 
-def cached_episode_key(world: World, seed: int) -> cache.Key:
-    """Return the key of a cached episode."""
-    return cache.episode_key(world, str(seed))
-
-
 def is_episode_cached(world: World, seed: int) -> bool:
     """Return whether the cache holds a valid file of the episode."""
-    return cache.is_cached(cached_episode_key(world, seed))
+    return cache.is_cached(cache.episode_key(world, seed))
 
 
 def build_cached_episode(world: World, episode: Episode) -> np.ndarray:

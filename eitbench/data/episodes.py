@@ -15,8 +15,7 @@ from tqdm import tqdm
 
 from eitbench import _check
 from eitbench._notice import SlowTaskNotice
-from eitbench.data.cache import Key, cached, episode_key
-from eitbench.worlds.instrument import Faults
+from eitbench.data.cache import cached, episode_key
 from eitbench.worlds.random_streams import episode_streams
 from eitbench.worlds.world import Discretisation, World
 
@@ -36,14 +35,6 @@ class Episode(NamedTuple):
     """(T, L) standard normal draws, one for each measurement."""
     velocity: np.ndarray
     """(T, p) m/s at `VelocityModel.points`, t = 1 … T; p = 0 if the task does not request it."""
-
-    def voltages(self, step: int, currents: np.ndarray, world: World) -> np.ndarray:
-        """Return noisy voltages (L,) in V of an intact instrument that injects ``currents`` (L,)
-        in A (A/m in 2D) at ``step`` 1 … T."""
-        k = slice(step - 1, step)
-        return world.instrument.measure(Faults.none(len(currents)), step,
-                                        self.transfer_resistance[k], currents[None],
-                                        self.noise[k])[0]
 
 
 def simulate(world: World, seed: int, *, cache: bool = True, progress: bool = True) -> Episode:
@@ -67,16 +58,7 @@ def simulate(world: World, seed: int, *, cache: bool = True, progress: bool = Tr
 
     if not cache:
         return Episode(**build())
-    return Episode(**cached(_key(world, seed), build))
-
-
-def is_simulated(world: World, seed: int) -> bool:
-    """Return whether the cache holds the truth."""
-    return _key(world, seed).path.is_file()
-
-
-def _key(world: World, seed: int) -> Key:
-    return episode_key(world, f"{seed}.truth")
+    return Episode(**cached(episode_key(world, f"{seed}.truth"), build))
 
 
 def cache_per_truth(size: int) -> Callable[[Callable[[World], Made]], Callable[[World], Made]]:

@@ -3,10 +3,13 @@ header of a Hugging Face data card, and Croissant metadata."""
 
 from __future__ import annotations
 
+import hashlib
 import io
 import json
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
+from datetime import date
 from pathlib import Path
+from string import Template
 from typing import Any
 
 import numpy as np
@@ -16,7 +19,6 @@ from eitbench import _check
 from eitbench._extras import require_extra
 from eitbench._files import PACKAGE, write_atomically
 from eitbench.data.cache import config_dict, world_digest
-from eitbench.data.croissant import croissant
 from eitbench.data.dataset import Dataset
 from eitbench.data.episode_cache import CSR_ARRAYS
 from eitbench.data.presimulation import presimulate
@@ -24,6 +26,7 @@ from eitbench.data.seeds import format_seed, is_test, parse_seeds, seed_ranges
 
 SUFFIXES = {"npz": "npz", "hdf5": "h5"}
 """Format -> suffix of its files."""
+MIME_TYPES = {".npz": "application/x-npz", ".h5": "application/x-hdf5", ".json": "application/json"}
 MESH = "mesh.npz"
 INTEGRAL = "(mol/m³)²·m² (m³ in 3D)"
 FIELDS = {
@@ -82,13 +85,13 @@ def export(examples: Dataset, folder: Path, format: str = "npz", *, n_jobs: int 
     tests = any(is_test(parse_seeds(name)[0]) for name in held)
     fields = {name: (shape.format(**about), unit, meaning)
               for name, (shape, unit, meaning) in FIELDS.items()}
-    readme = (PACKAGE / "data" / "export_readme.md").read_text(encoding="utf-8").format(
+    readme = _template("readme.md").format(
         held=seed_ranges(held), warning=WARNING if tests else "", ms=1e3 * about["time_step"],
         numbers=json.dumps(about["world"], indent=1), **about,
         table="\n".join(f"| `{name}` | {' | '.join(texts)} |" for name, texts in fields.items()))
     write_atomically(folder / "README.md", readme.encode())
     files = [folder / "dataset.json", folder / MESH, *folder.glob(f"[!.]*-*.{suffix}")]
-    write_atomically(folder / "croissant.json", croissant(about, files, fields))
+    write_atomically(folder / "croissant.json", _croissant(about, files, fields))
     return len(missing)
 
 
@@ -115,6 +118,26 @@ def _check_or_write_manifest(folder: Path, manifest: str) -> None:
         raise ValueError(f"out must be a new or empty folder, or one of an export; got {folder}")
     else:
         write_atomically(path, manifest.encode())
+
+
+def _template(name: str) -> str:
+    return (PACKAGE / "data" / f"export_{name}").read_text(encoding="utf-8")
+
+
+def _croissant(about: dict[str, Any], files: Iterable[Path],
+               fields: dict[str, tuple[str, str, str]]) -> bytes:
+    """Return Croissant 1.1 metadata with fields on responsible AI (RAI 1.0), dated today."""
+    metadata = json.loads(Template(_template("croissant.json")).substitute(
+        about, name=about["environment"].replace("/", "-"), date=date.today().isoformat()))
+    metadata["distribution"] = [{
+        "@type": "cr:FileObject", "@id": path.name, "name": path.name, "contentUrl": path.name,
+        "contentSize": f"{path.stat().st_size} B", "encodingFormat": MIME_TYPES[path.suffix],
+        "sha256": hashlib.sha256(path.read_bytes()).hexdigest()} for path in sorted(files)]
+    (arrays,) = metadata["recordSet"]
+    columns = [field["name"] for field in arrays["field"]]
+    arrays["data"] = [dict(zip(columns, (name, *texts), strict=True))
+                      for name, texts in fields.items()]
+    return json.dumps(metadata, indent=1, ensure_ascii=False).encode()
 
 
 def _npz(arrays: Mapping[str, Any]) -> bytes:

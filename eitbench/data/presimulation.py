@@ -12,7 +12,6 @@ from eitbench import _check
 from eitbench.data import cache
 from eitbench.data.episode_cache import (
     build_cached_episode,
-    cached_episode_key,
     is_episode_cached,
     scoring_constants,
     step_dtype,
@@ -47,41 +46,35 @@ def missing_seeds(world: World, seeds: Sequence[int]) -> list[int]:
     return [seed for seed in checked if not is_episode_cached(world, seed)]
 
 
-def presimulate(world: World, seeds: Sequence[int], *, n_jobs: int = 1,
-                backend: str = "loky") -> int:
+def presimulate(world: World, seeds: Sequence[int], *, n_jobs: int = 1, backend: str = "loky",
+                show_steps: bool = False) -> int:
     """Simulate the missing episodes in ``n_jobs`` processes and return their number.
 
     ``backend`` is one of `eitbench.data.parallel.BACKENDS`; a cluster needs the cache folder on all
     machines. Each episode is stored as soon as it is finished, so that the same call resumes after
-    an interruption. The concentration fields, five times larger, are not stored.
+    an interruption. The concentration fields, five times larger, are not stored. Progress is shown
+    by episodes, or with ``show_steps`` by time steps.
     """
     n_jobs = _check.integer("n_jobs", n_jobs, low=1)
     missing = missing_seeds(world, seeds)
     size = max(1, min(BATCH_SIZE, -(-len(missing) // n_jobs)))
     # A worker may have started with another value of $EITBENCH_CACHE.
     folder = cache.cache_folder().absolute()
-    batches = [(world, missing[k:k + size], folder) for k in range(0, len(missing), size)]
-    with tqdm(total=len(missing), desc="simulating", unit="episode", disable=None) as bar:
+    batches = [(world, missing[k:k + size], folder, show_steps)
+               for k in range(0, len(missing), size)]
+    with tqdm(total=len(missing), desc="simulating", unit="episode",
+              disable=show_steps or None) as bar:
         for done in run_parallel(_simulate_and_store, batches, n_jobs, backend):
             bar.update(done)
     return len(missing)
 
 
-def presimulate_inline(world: World, seeds: Sequence[int]) -> None:
-    """Simulate the missing episodes in this process, and report the progress."""
-    missing = missing_seeds(world, seeds)
-    for k in range(0, len(missing), BATCH_SIZE):
-        batch = missing[k:k + BATCH_SIZE]
-        _simulate_and_store(world, batch, cache.cache_folder(), progress=True)
-
-
-def _simulate_and_store(world: World, seeds: Sequence[int], folder: Path,
-                        progress: bool = False) -> int:
+def _simulate_and_store(world: World, seeds: Sequence[int], folder: Path, progress: bool) -> int:
     """Simulate and store episodes, and return their number."""
     with cache.use_cache_dir(folder):
         for seed, episode in zip(seeds, simulate_batch(world, seeds, progress), strict=True):
             steps = build_cached_episode(world, episode)
-            cache.store(cached_episode_key(world, seed), {"steps": steps})
+            cache.store(cache.episode_key(world, seed), {"steps": steps})
     return len(seeds)
 
 
@@ -135,7 +128,8 @@ class EpisodeSampler:
         has_common_flow = type(world.flow).draw is Flow.draw and world.target.is_advected
         is_cheap = has_common_flow and scoring_constants(world).mass.shape[0] < LARGE_MESH_NODES
         try:
-            presimulate_inline(world, range(max(self._n_candidates, BATCH_SIZE * is_cheap)))
+            presimulate(world, range(max(self._n_candidates, BATCH_SIZE * is_cheap)),
+                        show_steps=True)
         except OSError as error:
             self._can_store = False
             cache.warn_cache_unwritable(cache.folder(world), error)

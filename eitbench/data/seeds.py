@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 import re
-import sys
 import warnings
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
 
-INTERNAL_PACKAGES = ("eitbench", "gymnasium")
-"""Packages that warnings skip when they name a line of the user."""
 SPLITS = {"train": range(0, 100_000), "dev": range(100_000, 200_000),
           "test": range(200_000, 300_000)}
 
@@ -74,7 +71,7 @@ _FOR_SCORES = ContextVar("allow_test_seeds", default=False)
 
 
 def warn_test_seeds(seeds: Iterable[int]) -> None:
-    """Warn of test seeds outside `allow_test_seeds`; Python shows it once per line of the user."""
+    """Warn of test seeds outside `allow_test_seeds`."""
     if _FOR_SCORES.get():
         return
     if reserved := [seed for seed in seeds if is_test(seed)]:
@@ -82,7 +79,7 @@ def warn_test_seeds(seeds: Iterable[int]) -> None:
                       f"{format_seed(reserved[0])}, on which methods are scored; a method "
                       "trained or chosen on it has no valid score; choose on dev seeds, "
                       f"from {SPLITS['dev'][0]}",
-                      ReservedSeedWarning, stacklevel=_user_stacklevel())
+                      ReservedSeedWarning, stacklevel=2)
 
 
 @contextmanager
@@ -93,14 +90,3 @@ def allow_test_seeds() -> Iterator[None]:
         yield
     finally:
         _FOR_SCORES.reset(token)
-
-
-def _user_stacklevel() -> int:
-    """Return the ``stacklevel`` of the first caller outside `INTERNAL_PACKAGES`, for a warning by
-    the caller of this function."""
-    level = 1
-    frame = sys._getframe(1)
-    while frame.f_back and frame.f_globals.get("__name__", "").split(".")[0] in INTERNAL_PACKAGES:
-        frame = frame.f_back
-        level += 1
-    return level

@@ -202,8 +202,8 @@ class EstimationEnv(EpisodeEnv):
         n_steps = self.world.n_steps
         self.core.load_until(n_steps)
         correct = make_task(self.world, self.lag)
-        transport = self.world.true_transport(
-            Discretisation(correct.transport, correct.observation),
+        transport = self.world.flow.true_transport(
+            self.world, Discretisation(correct.transport, correct.observation),
             episode_streams(self.core.seeds[0]).flow)
         return PrivilegedInfo(self.core.voltages[:n_steps, 0].copy(),
                         self.core.currents[:n_steps].copy(), transport, velocity)
@@ -231,7 +231,8 @@ def make_core(name: str, variant: str | None = None, world: dict[str, Any] | Non
     assumed = registered.settings.get("assume", {}) if assume is None else assume
     if not isinstance(assumed, Mapping):
         raise ValueError(f"assume must be a dict of assumptions on the flow, got {assumed!r}")
-    changed.flow.check_assumed(changed, dict(assumed))
+    if assumed:
+        changed.flow.assumed_velocity(changed, **assumed)
     steps = lag_steps(changed, registered.settings.get("lag", 0) if lag is None else lag)
     return EstimationCore(changed, steps, dict(assumed))
 

@@ -107,9 +107,9 @@ class MeasuredEnv(gym.Env[Observation, np.ndarray]):  # type: ignore[misc]
                                    voltages=np.where(spikes, np.nan, measurements.voltages))
         self.measurements = measurements
         T, (M, L) = len(measurements.injection_index), measurements.matrix.shape
-        if self.vessel.n_electrodes != L:
+        if (count := self.vessel.shape.n_electrodes) != L:
             raise ValueError(f"vessel must have the {L} electrodes of the measurements, got "
-                             f"{self.vessel.n_electrodes}")
+                             f"{count}")
         self.withheld = _check.number("withheld", withheld, low=0.0, high=0.5)
         reference = measurements.reference_frames(homogeneous_frames)
         self._electrodes = self.vessel.electrode_model(INITIAL_CONTACT_IMPEDANCE)
@@ -156,7 +156,7 @@ class MeasuredEnv(gym.Env[Observation, np.ndarray]):  # type: ignore[misc]
             mask=self.available & ~self.withheld_mask,
             **self._options)
         """information for the agent"""
-        self._full_model = self.model.with_mask(self.available)
+        self._full_model = replace(self.model, mask=self.available)
         self._seed = seed
 
     @property

@@ -12,6 +12,7 @@ import numpy as np
 from scipy.optimize import least_squares, nnls
 
 from eitbench import _check
+from eitbench.measured.measurements import check_voltages
 from eitbench.physics.cem import CompleteElectrodeModel
 from eitbench.physics.observation import VoltageNoise
 
@@ -104,14 +105,9 @@ def calibrate(electrodes: CompleteElectrodeModel, currents: np.ndarray, matrix: 
     L = electrodes.n_electrodes
     currents = _check.array("currents", currents, (None, L), units="A")
     matrix = _check.array("matrix", matrix, (None, L))
-    voltages = np.asarray(voltages, dtype=float)
-    if voltages.ndim != 3 or voltages.shape[1:] != (len(currents), len(matrix)):
-        raise ValueError("voltages must have shape (F, K, M) with K = "
-                         f"{len(currents)} and M = {len(matrix)}, got {voltages.shape}")
+    voltages = check_voltages("voltages", voltages, (None, len(currents), len(matrix)))
     finite = np.isfinite(voltages)
     used = finite.any(axis=0)
-    if not used.any():
-        raise ValueError("voltages must hold numbers, got NaN only")
     count = np.maximum(finite.sum(axis=0), 1)
     mean = np.where(finite, voltages, 0.0).sum(axis=0) / count
     if not mean.any():

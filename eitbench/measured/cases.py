@@ -9,9 +9,8 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-import re
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -19,26 +18,22 @@ from typing import Any
 import numpy as np
 
 from eitbench import _check
+from eitbench._extras import require_extra
 from eitbench.measured.measurements import Measurements
 from eitbench.measured.readers import load_yaml, read
 from eitbench.measured.segmentation import read_truth
 
 CASES = Path(__file__).with_name("cases")
+CASE_SCHEMA = Path(__file__).with_name("case_schema.json")
+"""JSON schema of the entries of a case."""
 WITHHELD_FRACTION = 0.1
 """Fraction of the measurements that scores methods."""
 FOLDER_VARIABLE = "EITBENCH_MEASURED"
-_TEXTS = ("title", "file", "sha256", "licence", "source")
-_OPTIONAL = ("auxiliary_files", "truth", "address")
-_SETTINGS = ("format", "span", "correction", "homogeneous_frames", "moves", "model_error")
-"""Arguments of `read` and `MeasuredEnv`, and ``span``: start and stop of the injections used."""
 
 
 @dataclass(frozen=True, eq=False)
 class MeasuredCase:
-    """One set of measurements with its vessel and settings, the same for all methods.
-
-    ``ValueError`` names an entry that is missing, unknown, or of the wrong type.
-    """
+    """One set of measurements with its vessel and settings, the same for all methods."""
 
     name: str
     title: str
@@ -59,34 +54,7 @@ class MeasuredCase:
     """of a folder with the files, ending in "/", or of a zip archive whose first folder has them;
     empty: they cannot be downloaded automatically"""
     settings: Mapping[str, Any] = field(default_factory=dict)
-
-    def __post_init__(self) -> None:
-        for name in _TEXTS:
-            value = getattr(self, name)
-            if not isinstance(value, str) or not value.strip():
-                raise ValueError(f"case.{name} must be a text, got {value!r}")
-        for name, entries in {"vessel": self.vessel, "truth": self.truth or {},
-                              "auxiliary_files": self.auxiliary_files}.items():
-            if not isinstance(entries, Mapping):
-                raise ValueError(f"case.{name} must be entries like 'name: value', got {entries!r}")
-        if self.truth is not None and set(self.truth) != {"file", "sha256"}:
-            raise ValueError(f"case.truth must have file and sha256, got {self.truth!r}")
-        if not re.fullmatch(r"(https?://\S+)?", str(self.address)):
-            raise ValueError(f"case.address must begin with https://, got {self.address!r}")
-        digests = {"sha256": self.sha256, **self.auxiliary_files,
-                   **({"truth.sha256": self.truth["sha256"]} if self.truth else {})}
-        for name, digest in digests.items():
-            if not isinstance(digest, str) or not re.fullmatch("[0-9a-f]{64}", digest):
-                raise ValueError(f"case.{name} must be 64 hexadecimal digits, got {digest!r}")
-        span = self.settings.get("span", [0, 1])
-        if not (isinstance(span, list) and [*map(type, span)] == [int, int]
-                and 0 <= span[0] < span[1]):
-            raise ValueError("case.span must be two increasing numbers such as [0, 800], got "
-                             f"{span!r}")
-        if unknown := sorted(set(self.settings) - set(_SETTINGS)):
-            names = (*_TEXTS, "vessel", *_OPTIONAL, *_SETTINGS)
-            raise ValueError(f"case must have entries of {', '.join(names)}, got "
-                             f"{', '.join(unknown)}")
+    """arguments of `read` and `MeasuredEnv`, and ``span``: start and stop of the injections used"""
 
     @cached_property
     def digest(self) -> str:
@@ -154,21 +122,27 @@ def case_id(name: str) -> str:
 
 
 def read_case(name: Path | str) -> MeasuredCase:
-    """Read a built-in case by name, or the case of a YAML file. ``ValueError`` names the file and
-    the error."""
+    """Read a built-in case by name, or the case of a YAML file. ``ValueError`` names the file, and
+    entries that are missing, unknown, or of the wrong type."""
     path = Path(name)
     if path.suffix != ".yml":
         names = {each.stem: each for each in sorted(CASES.glob("*.yml"))}
         _check.choice("case, if not a YAML file,", str(name), names)
         path = names[str(name)]
     entries = load_yaml(path, "case")
-    if missing := [each for each in (*_TEXTS, "vessel") if each not in entries]:
-        raise ValueError(f"{path}: case must have {', '.join(missing)}")
-    fixed = {each: entries.pop(each) for each in (*_TEXTS, "vessel", *_OPTIONAL) if each in entries}
+    with require_extra("the YAML file of a case"):
+        import jsonschema_rs
+    schema = jsonschema_rs.validator_for(json.loads(CASE_SCHEMA.read_text(encoding="utf-8")))
     try:
-        return MeasuredCase(path.stem, **fixed, settings=entries)
-    except ValueError as error:
-        raise ValueError(f"{path}: {error}") from None
+        wrong = [f"{'.'.join(['case', *map(str, error.instance_path)])}: {error.message}"
+                 for error in schema.iter_errors(entries)]
+    except ValueError as error:                         # a date, or a name that is not a text
+        wrong = [f"case: {error}"]
+    if wrong:
+        raise ValueError(f"{path}: {'; '.join(wrong)}")
+    fixed = {each.name: entries.pop(each.name) for each in fields(MeasuredCase)
+             if each.name in entries}
+    return MeasuredCase(path.stem, **fixed, settings=entries)
 
 
 def check_file(path: Path, digest: str, case: str) -> None:

@@ -53,7 +53,7 @@ class Measurements:
         K, L = currents.shape
         matrix = _check.array("matrix", self.matrix, (None, L))
         M = len(matrix)
-        voltages = _check_voltages("voltages", self.voltages, (None, M))
+        voltages = check_voltages("voltages", self.voltages, (None, M))
         T = len(voltages)
         times = _check.array("times", self.times, (T,), units="s")
         if (back := np.flatnonzero(np.diff(times) <= 0)).size:
@@ -64,7 +64,7 @@ class Measurements:
         arrays = {"currents": currents, "injection_index": index, "matrix": matrix,
                   "voltages": voltages, "times": times}
         if self.reference is not None:
-            arrays["reference"] = _check_voltages("reference", self.reference, (None, K, M))
+            arrays["reference"] = check_voltages("reference", self.reference, (None, K, M))
         json.dumps(dict(self.source), allow_nan=False)
         for name, value in arrays.items():
             if value.flags.writeable:
@@ -84,7 +84,7 @@ class Measurements:
         order = np.argsort(first)                              # order of first use
         index = np.argsort(order)[inverse.reshape(-1)]
         if reference is not None:
-            reference = _check_voltages("reference", reference, (None, len(currents), None))
+            reference = check_voltages("reference", reference, (None, len(currents), None))
             reference = _sort_by_injection(reference, index, len(distinct))
         return cls(distinct[order], index, matrix, voltages, times, reference, source or {})
 
@@ -142,8 +142,8 @@ class Measurements:
         return path
 
     @classmethod
-    def load(cls, path: Path | str, steps: slice = slice(None)) -> Measurements:
-        """Read a file of `save`, or only the measurement vectors ``steps``.
+    def load(cls, path: Path | str) -> Measurements:
+        """Read a file of `save`.
 
         Data sets of more than `MAX_IN_MEMORY_BYTES` are memory-mapped; their file must not
         change. ``ValueError`` names the file and the error.
@@ -161,24 +161,21 @@ class Measurements:
                     raise ValueError(f"{', '.join(sorted(missing))} must be data sets of the file")
                 content = {name: file[name][()] for name in ("currents", "matrix", "reference")
                            if name in file}
-                content |= {name: _read_rows(path, file[DATASETS[name]], steps)
+                content |= {name: _read_rows(path, file[DATASETS[name]])
                             for name in ("injection_index", "times", "voltages")}
-                if not content["times"].size:
-                    raise ValueError(f"steps must select some of its {len(file['times'])} "
-                                     f"measurement vectors, got {steps}")
                 source = json.loads(file.attrs["source"])
             return cls(**content, source=source)
         except (OSError, KeyError, ValueError, TypeError) as error:
             raise ValueError(f"{path} must be a file of measurements: {error}") from None
 
 
-def _read_rows(path: Path, dataset: Any, steps: slice) -> np.ndarray:
-    """Read rows of a data set, or map them if they are large, contiguous and of native type."""
+def _read_rows(path: Path, dataset: Any) -> np.ndarray:
+    """Read a data set, or map them if they are large, contiguous and of native type."""
     large = dataset.size * dataset.dtype.itemsize > MAX_IN_MEMORY_BYTES
     offset = dataset.id.get_offset()                 # None if it is compressed or chunked
     if large and offset is not None and dataset.dtype in (np.float64, np.int64):
-        return np.memmap(path, dataset.dtype, "r", offset, dataset.shape)[steps]
-    rows: np.ndarray = dataset[steps]
+        return np.memmap(path, dataset.dtype, "r", offset, dataset.shape)
+    rows: np.ndarray = dataset[()]
     rows.setflags(write=False)                       # avoids a copy in __post_init__
     return rows
 
@@ -225,7 +222,7 @@ def _check_index(value: np.ndarray, T: int, K: int) -> np.ndarray:
     return index.astype(np.int64, copy=False)
 
 
-def _check_voltages(name: str, value: np.ndarray, shape: tuple[int | None, ...]) -> np.ndarray:
+def check_voltages(name: str, value: np.ndarray, shape: tuple[int | None, ...]) -> np.ndarray:
     """Return an array of this shape whose entries are finite or NaN, not all of them NaN."""
     voltages = _check.array(name, value, shape, units="V", allow_nan=True)
     if np.isnan(voltages).all():

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import KW_ONLY, dataclass, replace
+from dataclasses import KW_ONLY, dataclass
 from typing import Any
 
 import numpy as np
@@ -46,10 +46,6 @@ class MeasurementModel:
     def cem(self) -> CompleteElectrodeModel:
         """The electrode model."""
         return self.observation.cem
-
-    def with_mask(self, mask: np.ndarray) -> MeasurementModel:
-        """Return the same model with another mask (K, M)."""
-        return replace(self, mask=mask)
 
     def voltages(self, concentration: np.ndarray, currents: np.ndarray) -> np.ndarray:
         """Predict voltages (J, M) in V for ``concentration`` (n,) in mol/m³ and injections (J, L)

@@ -48,13 +48,11 @@ def read(path: Path | str, format: str | None = None, steps: slice | None = None
     _check.choice("format", format, READERS)
     if format == "table" and "electrodes" not in options:
         options = _table_options(path) | options
-    names = set(signature(READERS[format]).parameters) - {"path", "steps"}
+    names = set(signature(READERS[format]).parameters) - {"path"}
     if unknown := sorted(set(options) - names):
-        raise ValueError(f"options of a file of format {format} must be among "
+        raise ValueError(f"options of {path} (format {format}) must be among "
                          f"{', '.join(sorted(names)) or '(none)'}, got {', '.join(unknown)}")
     try:
-        if format == "hdf5" and steps is not None:
-            return Measurements.load(path, steps).select(slice(None))
         measurements = READERS[format](path, **options)
         return measurements if steps is None else measurements.select(steps)
     except ValueError as error:
@@ -153,7 +151,13 @@ def _read_frame(path: Path, frequency: float | None) -> tuple[
     if mode not in (SINGLE_ENDED, DIFFERENTIAL):
         raise ValueError(f"{path} must have the measurement mode {SINGLE_ENDED} (single-ended) or "
                          f"{DIFFERENTIAL} (differential), got {mode}")
-    index = _frequency_index(path, low, high, n_frequencies, frequency)
+    if frequency is None and n_frequencies == 1:
+        frequency = low
+    indices = {low: 0, high: n_frequencies - 1}         # the header does not list those between
+    if frequency not in indices:
+        raise ValueError(f"{path} holds {n_frequencies} frequencies from {low:g} to {high:g} Hz: "
+                         f"frequency must be {low:g} or {high:g}, got {frequency}")
+    index = indices[frequency]
     body = [line.split() for line in lines[header:]]
     try:
         pairs = np.array(body[::1 + n_frequencies], dtype=int)
@@ -167,20 +171,8 @@ def _read_frame(path: Path, frequency: float | None) -> tuple[
         raise ValueError(f"{path} must hold blocks of lines after its header: two electrodes from "
                          f"1 to {count}, and for each frequency ({n_frequencies}) {2 * count} "
                          "numbers with decimal points, two for each channel")
-    hertz = low if frequency is None else frequency
-    return (time, (hertz, amplitude, mode == DIFFERENTIAL, pairs.tolist()), parts[:, :2 * count:2])
-
-
-def _frequency_index(path: Path, low: float, high: float, count: int,
-                     frequency: float | None) -> int:
-    """Return the position of the chosen frequency: the lowest or the highest, since the header
-    does not list those between."""
-    if count == 1 and frequency in (None, low):
-        return 0
-    if frequency in (low, high) and count > 1:
-        return 0 if frequency == low else count - 1
-    raise ValueError(f"{path} holds {count} frequencies from {low:g} to {high:g} Hz: frequency "
-                     f"must be {low:g} or {high:g}, got {frequency}")
+    return (time, (frequency, amplitude, mode == DIFFERENTIAL, pairs.tolist()),
+            parts[:, :2 * count:2])
 
 
 def read_table(path: Path, *, electrodes: int, current: float, time_step: float = 1.0,
@@ -294,9 +286,6 @@ def _table_options(table: Path) -> dict[str, Any]:
                          f"16' and 'current: 0.001' (A), got neither {table.name}.yml nor a "
                          f"{table.stem}.yml of a table in the folder of {table}")
     options = load_yaml(path, "table")
-    known = sorted(set(signature(read_table).parameters) - {"path"})
-    for name in options:
-        _check.choice(f"each entry of {path}", name, known)
     if missing := {"electrodes", "current"} - set(options):
         raise ValueError(f"{path} must have {', '.join(sorted(missing))}")
     return options

@@ -28,8 +28,26 @@ DISC_WEIGHTS = np.array([1 / 4, *[1 / 8] * 6])
 """Quadrature weights, exact for polynomials of degree five."""
 
 
+class Body(Target):
+    """Bodies that the flow does not advect."""
+
+    is_advected = False
+
+    def states(self, world: World, points: np.ndarray, random: np.random.Generator,
+               last: int) -> np.ndarray:
+        """Return the concentration (last + 1, k) in mol/m³ at points (k, 2) of an episode."""
+        raise NotImplementedError
+
+    def evolve(self, world: World, episodes: Sequence[EpisodeStreams], truth: Discretisation,
+               tick: Callable[[int], object], last: int) -> Iterator[TruthTrajectory]:
+        for episode in episodes:
+            states = self.states(world, truth.transport.mesh.points, episode.flow, last)
+            tick(world.n_steps)
+            yield TruthTrajectory(states, np.empty((last, 0)))
+
+
 @dataclass(frozen=True)
-class ResistiveDisc(Target):
+class ResistiveDisc(Body):
     """A rigid disc of low conductivity that moves with the mean velocity of the flow over its area.
 
     Thesis 7.1, where it is a ball. All numbers [E].
@@ -43,8 +61,6 @@ class ResistiveDisc(Target):
     """mol/m³: a twentieth of the background, because a P1 conductivity has to stay positive"""
     initial_radius_range: tuple[float, float] = (0.25, 0.48)
     """initial distance from the centre relative to the tank's radius; the angle is uniform"""
-
-    is_advected = False
 
     def __post_init__(self) -> None:
         check_positive(self, background="mol/m³", radius="m", concentration="mol/m³")
@@ -82,12 +98,11 @@ class ResistiveDisc(Target):
             centre = centre * min(1.0, max_distance / max(np.hypot(*centre), 1e-12))
         return np.array(path)
 
-    def evolve(self, world: World, episodes: Sequence[EpisodeStreams], truth: Discretisation,
-               tick: Callable[[int], object], last: int) -> Iterator[TruthTrajectory]:
-        for episode in episodes:
-            path = self.path(world, episode.flow)[:last + 1]
-            tick(world.n_steps)
-            yield disc_trajectory(self, truth, path, self.radius, np.ones(len(path)))
+    def states(self, world: World, points: np.ndarray, random: np.random.Generator,
+               last: int) -> np.ndarray:
+        disc = np.array([disc_indicator(points, centre, self.radius, TRANSITION_WIDTH)
+                         for centre in self.path(world, random)[:last + 1]])
+        return self.background + (self.concentration - self.background) * disc
 
 
 class BodyPath(NamedTuple):
@@ -102,7 +117,7 @@ class BodyPath(NamedTuple):
 
 
 @dataclass(frozen=True)
-class WanderingBody(Target):
+class WanderingBody(Body):
     """A resistive disc that moves by itself in a liquid at rest. All numbers [E].
 
     It runs straight ahead and turns into a random direction, and to a random speed, at random
@@ -123,8 +138,6 @@ class WanderingBody(Target):
     """s, mean time that the body is present"""
     absence_time: float = 0.5
     """s, mean time that it is absent"""
-
-    is_advected = False
 
     def __post_init__(self) -> None:
         check_positive(self, background="mol/m³", concentration="mol/m³", run_time="s",
@@ -167,16 +180,16 @@ class WanderingBody(Target):
     def _velocity(self, random: np.random.Generator) -> np.ndarray:
         return random.uniform(*self.speed_range) * _direction(random)
 
-    def evolve(self, world: World, episodes: Sequence[EpisodeStreams], truth: Discretisation,
-               tick: Callable[[int], object], last: int) -> Iterator[TruthTrajectory]:
-        for episode in episodes:
-            centres, present, radius = self.path(world, episode.flow)
-            tick(world.n_steps)
-            yield disc_trajectory(self, truth, centres[:last + 1], radius, present[:last + 1])
+    def states(self, world: World, points: np.ndarray, random: np.random.Generator,
+               last: int) -> np.ndarray:
+        centres, present, radius = self.path(world, random)
+        disc = np.array([there * disc_indicator(points, centre, radius, TRANSITION_WIDTH)
+                         for centre, there in zip(centres[:last + 1], present, strict=False)])
+        return self.background + (self.concentration - self.background) * disc
 
 
 @dataclass(frozen=True)
-class Cylinders(Target):
+class Cylinders(Body):
     """Two stationary metal cylinders, drawn for each episode (thesis 7.2, Fig. 7.4)."""
 
     background: float = 30.0
@@ -193,24 +206,20 @@ class Cylinders(Target):
     """concentration of the metal relative to the background. Its surface has a resistance, and EIT
     hardly distinguishes conductivities of small bodies above a ratio of five [E]"""
 
-    is_advected = False
     is_stationary = True
 
     def __post_init__(self) -> None:
         check_positive(self, background="mol/m³", concentration_ratio="", min_gap="m")
+        check_range(self, "large_radius", "m")
+        check_range(self, "small_radius", "m")
 
     def check(self, world: World) -> None:
         """Raise ``ValueError`` if the cylinders do not fit into the vessel."""
         tank = world.vessel.radius
-        for name in ("large_radius", "small_radius"):
-            given = getattr(self, name)
-            low, high = _check.array(f"target.{name}", given, (2,), units="m")
-            if not 0 < low <= high < 0.3 * tank:
-                raise ValueError(f"target.{name} must be a range 0 < low ≤ high < 0.3·radius in m, "
-                                 f"got {given!r}")
-        if self.small_radius[1] > self.large_radius[1]:
-            raise ValueError("target.small_radius must not reach beyond large_radius, got "
-                             f"{self.small_radius!r} and {self.large_radius!r} m")
+        if not self.small_radius[1] <= self.large_radius[1] < 0.3 * tank:
+            raise ValueError("target.small_radius must not reach beyond large_radius, nor this "
+                             f"beyond {0.3 * tank:g} m, got {self.small_radius!r} and "
+                             f"{self.large_radius!r} m")
         _check.integer("vessel.n_electrodes", world.vessel.n_electrodes, low=8)
         inside = 1.0 - self.large_radius[1] / tank
         _check.number("target.max_centre_radius", self.max_centre_radius, low=0.5, high=inside)
@@ -232,27 +241,12 @@ class Cylinders(Target):
             if np.hypot(*(centres[0] - centres[1])) > sum(radii) + self.min_gap:
                 return list(zip(centres, radii, strict=True))
 
-    def evolve(self, world: World, episodes: Sequence[EpisodeStreams], truth: Discretisation,
-               tick: Callable[[int], object], last: int) -> Iterator[TruthTrajectory]:
-        points = truth.transport.mesh.points
-        for episode in episodes:
-            metal = np.sum([disc_indicator(points, centre, radius, TRANSITION_WIDTH)
-                            for centre, radius in self.draw(world, episode.flow)], axis=0)
-            concentration = self.background * (1.0 + (self.concentration_ratio - 1.0) * metal)
-            tick(world.n_steps)
-            states = np.repeat(concentration[None], last + 1, axis=0)
-            yield TruthTrajectory(states, np.empty((last, 0)))
-
-
-def disc_trajectory(target: ResistiveDisc | WanderingBody, truth: Discretisation,
-                    centres: np.ndarray, radius: float, present: np.ndarray) -> TruthTrajectory:
-    """Return the trajectory of a disc with centres (T + 1, 2) and a radius in m, where it is
-    present (T + 1,)."""
-    points = truth.transport.mesh.points
-    disc = np.array([there * disc_indicator(points, centre, radius, TRANSITION_WIDTH)
-                     for centre, there in zip(centres, present, strict=True)])
-    return TruthTrajectory(target.background + (target.concentration - target.background) * disc,
-                           np.empty((len(centres) - 1, 0)))
+    def states(self, world: World, points: np.ndarray, random: np.random.Generator,
+               last: int) -> np.ndarray:
+        metal = np.sum([disc_indicator(points, centre, radius, TRANSITION_WIDTH)
+                        for centre, radius in self.draw(world, random)], axis=0)
+        concentration = self.background * (1.0 + (self.concentration_ratio - 1.0) * metal)
+        return np.repeat(concentration[None], last + 1, axis=0)
 
 
 def reflect(centres: np.ndarray, velocities: np.ndarray,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any
@@ -14,6 +14,7 @@ from eitbench import _check
 from eitbench.physics.flow import PlaneChannelFlow, PowerLawFlow
 from eitbench.physics.profiles import SkewedChannelFlow, VelocityModel, parabolic_model
 from eitbench.worlds.fields import check_positive, check_range
+from eitbench.worlds.task import make_task
 from eitbench.worlds.vessels import Bulge, PlanePipe
 from eitbench.worlds.world import Discretisation, Flow, World, reject_unknown_assumptions
 
@@ -42,9 +43,6 @@ class PipeFlow(Flow):
 
     def nominal(self, world: World, fine: bool) -> VelocityField:
         return world.vessel.laminar_velocity(self.mean_velocity)
-
-    def check_assumed(self, world: World, assumed: Mapping[str, Any]) -> None:
-        self.assumed_velocity(world, **assumed)
 
     def assumed_velocity(self, world: World, **assumed: Any) -> VelocityField:
         """Accept ``mean_velocity`` in m/s and, in a plane pipe, ``profile``, one of `PROFILES`."""
@@ -229,7 +227,7 @@ class TurbulentFlow(PipeFlow):
 
     def true_transport(self, world: World, model: Discretisation, random: np.random.Generator,
                        ) -> Callable[[float], Transport]:
-        """See `World.true_transport`; t may be fractional if the model has shorter steps."""
+        """See `Flow.true_transport`; t may be fractional if the model has shorter steps."""
         from eitbench.physics.transport import ConvectionDiffusion
         from eitbench.physics.turbulence import FluctuatingTransport
         assert isinstance(model.transport, ConvectionDiffusion)
@@ -261,20 +259,18 @@ class FlowPastBulge(PipeFlow):
         """Return the true flow, computed once per process."""
         return _past_bulge(world.vessel, self, (96, 24) if fine else (64, 16))
 
-    def check_assumed(self, world: World, assumed: Mapping[str, Any]) -> None:
+    def assumed_velocity(self, world: World, **assumed: Any) -> VelocityField:
         """Accept ``flow``, one of `BULGE_FLOW_ASSUMPTIONS`."""
         reject_unknown_assumptions(assumed, ("flow",))
-        _check.choice("assume.flow", assumed.get("flow", "parabolic"), BULGE_FLOW_ASSUMPTIONS)
-
-    def assumed_velocity(self, world: World, **assumed: Any) -> VelocityField:
-        self.check_assumed(world, assumed)
-        if assumed.get("flow") == "real":
+        flow = assumed.get("flow", "parabolic")
+        _check.choice("assume.flow", flow, BULGE_FLOW_ASSUMPTIONS)
+        if flow == "real":
             return self.nominal(world, fine=False)
         return LocalParabola(self.mean_velocity, world.vessel.half_width, world.vessel.bulge)
 
     def true_transport(self, world: World, model: Discretisation, random: np.random.Generator,
                        ) -> Callable[[int], Transport]:
-        real = _real_model(world).transport
+        real = make_task(world, flow="real").transport
         return lambda t: real
 
 
@@ -348,12 +344,6 @@ class LocalParabola:
 def transit_steps(world: World, velocity: float) -> int:
     """Return the time steps in which fluid with this velocity in m/s passes the pipe."""
     return math.ceil(world.vessel.length / (velocity * world.time_step))
-
-
-@lru_cache(maxsize=1)
-def _real_model(world: World) -> Discretisation:
-    """Return one model per process: filters cache derived matrices by transport model."""
-    return world.estimator_model(flow="real")
 
 
 @lru_cache(maxsize=4)

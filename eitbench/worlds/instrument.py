@@ -27,12 +27,6 @@ class Faults(NamedTuple):
     noise_factor: np.ndarray
     """(L,) noise relative to an intact electrode"""
 
-    @classmethod
-    def none(cls, n_electrodes: int) -> Faults:
-        """Return the faults of an intact instrument."""
-        never = np.full(n_electrodes, np.iinfo(np.int64).max)
-        return cls(never, np.zeros(n_electrodes), np.ones(n_electrodes))
-
 
 @dataclass(frozen=True)
 class Instrument:

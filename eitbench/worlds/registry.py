@@ -16,7 +16,6 @@ from typing import Any
 import gymnasium as gym
 
 from eitbench import _check
-from eitbench.worlds.stored_names import warn_renamed
 from eitbench.worlds.world import World
 
 WORLDS_GROUP = "eitbench.worlds"
@@ -33,8 +32,6 @@ GROUPS = ("thesis examples", "extensions", "robustness variants", "injection", "
 """Groups of ids in lists of environments."""
 RETURNS = Path(__file__).with_name("returns.csv")
 """Mean returns of policies in the built-in injection environments, made by studies/returns.py."""
-EARLIER_KEYWORDS = {"about": "description", "seeds": "test_seeds", "home": "nominal"}
-"""Earlier keyword of `register` -> its keyword."""
 
 
 @dataclass(frozen=True)
@@ -117,10 +114,6 @@ def register(world: World, id: str, *, track: str = "estimation", description: s
         If the id has another form or belongs to another world, a setting is unknown, or ``nominal``
         has another task.
     """
-    texts = {"description": description, "test_seeds": test_seeds, "nominal": nominal}
-    for old in EARLIER_KEYWORDS.keys() & settings:
-        warn_renamed(old, EARLIER_KEYWORDS[old])
-        texts[EARLIER_KEYWORDS[old]] = settings.pop(old)
     if not re.fullmatch(r"[\w.-]+/[\w.-]+-v\d+", id):
         raise ValueError(f"id must look like 'namespace/Name-v0', got {id!r}")
     _check.choice("track", track, ENV_CLASSES)
@@ -132,8 +125,8 @@ def register(world: World, id: str, *, track: str = "estimation", description: s
         json.dumps(settings, allow_nan=False)
     except (TypeError, ValueError) as error:
         raise ValueError(f"settings must be fit for JSON: {error}") from None
-    entry = Entry(id, world, track, settings, **texts, group=group,
-                  is_starting_point=is_starting_point, is_reference=is_reference)
+    entry = Entry(id, world, track, settings, description, test_seeds, nominal, group,
+                  is_starting_point, is_reference)
     if entry.nominal:
         _check_same_task(entry)
     taken = _entries[id] != entry if id in _entries else id in gym.registry

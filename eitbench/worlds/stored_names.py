@@ -1,9 +1,7 @@
-"""Earlier names of classes, fields and members, which stored keys and users' scripts contain."""
+"""Earlier names of classes, fields and members, in stored keys and third-party classes."""
 
 from __future__ import annotations
 
-import warnings
-from collections.abc import Collection
 from dataclasses import fields, is_dataclass
 from operator import attrgetter
 
@@ -35,26 +33,6 @@ MEMBERS = {
     "assumed_velocity": "believed", "residence_steps": "flush_steps", "spin_up_steps": "lead_in",
     "is_advected": "is_carried", "is_stationary": "stands_still"}
 """Member of a vessel, flow or target -> its earlier name, which third-party classes may define."""
-WORLD_MEMBERS = {
-    "changed": "with_changes", "sound": "fault_free", "fluid": "truth_config",
-    "truth": "truth_model", "model": "estimator_model",
-    "flush_steps": "residence_steps", "lead_in": "spin_up_steps"}
-"""Earlier name of a member of `World` -> its name."""
-
-
-def current_field_name(name: str, known: Collection[str]) -> str:
-    """Return the field in ``known`` that ``name`` or its earlier name denotes, else ``name``."""
-    if name not in known:
-        for field in known:
-            if STORED_NAMES.get(field) == name:
-                warn_renamed(name, field)
-                return field
-    return name
-
-
-def warn_renamed(old: str, new: str) -> None:
-    """Warn that ``old`` is an earlier name."""
-    warnings.warn(f"{old} is now {new}", DeprecationWarning, stacklevel=4)
 
 
 def stored_names(kind: type) -> dict[str, str]:

@@ -355,22 +355,22 @@ class MeshVessel:
         return 16 if fine else 8
 
     def transport_mesh(self, fine: bool) -> tuple[Mesh, np.ndarray]:
-        mesh, groups = self._read(fine)
+        _, (mesh, groups) = self._read(fine)
         return mesh, np.unique(groups.get("inlet", np.empty(0, dtype=int)))
 
     def electrode_model(self, fine: bool) -> CompleteElectrodeModel:
         from eitbench.physics.cem import CompleteElectrodeModel
-        mesh, groups = self._read(fine)
+        file, (mesh, groups) = self._read(fine)
         numbered = {int(match[1]): facets for name, facets in groups.items()
                     if (match := re.fullmatch(r"electrode[ _-]?(\d+)", name, re.IGNORECASE))}
         first = 0 if 0 in numbered else 1
         numbers = range(first, first + self.n_electrodes)
         if missing := [f"electrode {number}" for number in numbers if number not in numbered]:
-            raise ValueError(f"{self._file(fine)[0]}: must have a group for each electrode, got "
+            raise ValueError(f"{file}: must have a group for each electrode, got "
                              f"none for {', '.join(missing)}; there are {', '.join(groups)}")
         if len(numbered) > self.n_electrodes:
             raise ValueError(f"n_electrodes must be {len(numbered)}, the number of groups "
-                             f"in {self._file(fine)[0]}, got {self.n_electrodes}")
+                             f"in {file}, got {self.n_electrodes}")
         electrodes = [numbered[number] for number in numbers]
         return CompleteElectrodeModel(mesh, electrodes, self.contact_impedance)
 
@@ -379,13 +379,10 @@ class MeshVessel:
         """Paths of the meshes, which a confined method may read."""
         return self.truth_mesh_file, self.model_mesh_file
 
-    def _file(self, fine: bool) -> tuple[str, str]:
-        if fine:
-            return self.truth_mesh_file, self.truth_mesh_sha256
-        return self.model_mesh_file, self.model_mesh_sha256
-
-    def _read(self, fine: bool) -> MeshData:
-        return _read(*self._file(fine), self.scale)
+    def _read(self, fine: bool) -> tuple[str, MeshData]:
+        file, sha256 = ((self.truth_mesh_file, self.truth_mesh_sha256) if fine else
+                        (self.model_mesh_file, self.model_mesh_sha256))
+        return file, _read(file, sha256, self.scale)
 
 
 def _check_electrodes(vessel: PlanePipe | RoundPipe | RoundTank) -> None:

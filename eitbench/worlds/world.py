@@ -15,12 +15,7 @@ from eitbench.worlds.fields import check_positive
 from eitbench.worlds.instrument import Instrument
 from eitbench.worlds.random_streams import EpisodeStreams, episode_streams
 from eitbench.worlds.schedule import Schedule
-from eitbench.worlds.stored_names import (
-    WORLD_MEMBERS,
-    add_current_members,
-    current_field_name,
-    warn_renamed,
-)
+from eitbench.worlds.stored_names import add_current_members
 
 if TYPE_CHECKING:
     from eitbench.numerics.mesh import Mesh
@@ -92,13 +87,10 @@ class Flow(Protocol):
     def nominal(self, world: World, fine: bool) -> VelocityField | None:
         """Return the velocity of the truth (``fine``) or the estimator model; None: no flow."""
 
-    def check_assumed(self, world: World, assumed: Mapping[str, Any]) -> None:
-        """Raise ``ValueError`` if `assumed_velocity` does not accept ``assumed``; cheap."""
-        reject_unknown_assumptions(assumed, ())
-
     def assumed_velocity(self, world: World, **assumed: Any) -> VelocityField | None:
-        """Return the velocity of the estimator model under other assumptions than the default."""
-        self.check_assumed(world, assumed)
+        """Return the velocity of the estimator model under other assumptions than the default;
+        ``ValueError`` for an assumption that it does not accept."""
+        reject_unknown_assumptions(assumed, ())
         return self.nominal(world, fine=False)
 
     def residence_steps(self, world: World) -> int:
@@ -120,7 +112,11 @@ class Flow(Protocol):
 
     def true_transport(self, world: World, model: Discretisation,
                        random: np.random.Generator) -> Callable[[int], Transport]:
-        """See `World.true_transport`."""
+        """Return t -> an episode's true transport from t − 1 to t, on the mesh of ``model``.
+
+        For oracles. ``model`` is the estimator model without wrong assumptions, ``random`` the
+        unused stream of the episode.
+        """
         drawn = self.draw(world, random)
         if drawn is None:
             return lambda t: model.transport
@@ -309,15 +305,6 @@ class World:
         """
         return self._discretise(self.flow.assumed_velocity(self, **assumed), fine=False)
 
-    def true_transport(self, model: Discretisation,
-                       flow: np.random.Generator) -> Callable[[int], Transport]:
-        """Return t -> an episode's true transport from t − 1 to t, on the mesh of ``model``.
-
-        For oracles. ``model`` is the estimator model without wrong assumptions, ``flow`` the
-        unused stream of the episode.
-        """
-        return self.flow.true_transport(self, model, flow)
-
     def true_observation(self, truth: Discretisation,
                          contacts: np.random.Generator) -> ObservationModel:
         """Return the observation model of an episode, with its drawn contact impedances.
@@ -368,13 +355,6 @@ class World:
                                        LinearConductivity(self.vessel.molar_conductivity),
                                        1e-2 * self.expected_concentration)
         return Discretisation(transport, observation)
-
-    def __getattr__(self, name: str) -> Any:
-        """Return a member by its earlier name."""
-        if name not in WORLD_MEMBERS:
-            raise AttributeError(f"World has no attribute {name!r}")
-        warn_renamed(name, WORLD_MEMBERS[name])
-        return getattr(self, WORLD_MEMBERS[name])
 
     def __hash__(self) -> int:
         return self._hash
@@ -446,8 +426,7 @@ def _changed(part: Any, changes: Mapping[str, Any], where: str) -> Any:
     if isinstance(part, World):
         known.remove("name")
     made: dict[str, Any] = {}
-    for given, value in changes.items():
-        name = current_field_name(given, known)
+    for name, value in changes.items():
         if name not in known:
             raise ValueError(f"{where} has no {name!r}; there are {', '.join(known)}"
                              + _check.did_you_mean(name, known))

@@ -13,7 +13,7 @@ from eitbench.bench.runner import EstimatorOutput, run_estimator
 from eitbench.bench.store import EpisodeStore
 from eitbench.bench.tracks import Environment, subtrack_of
 from eitbench.data.cache import CACHE_VARIABLE
-from eitbench.data.episode_cache import truth_mesh
+from eitbench.data.episode_cache import cached_episode, cycle_voltages, truth_mesh
 from eitbench.data.episodes import simulate
 from eitbench.worlds.catalogue import PIPE_2D
 from eitbench.worlds.task import Estimate, Task
@@ -250,7 +250,7 @@ def test_scores_can_be_recomputed_from_what_is_stored(tilted):
     assert result["scores"]["error"] == pytest.approx(steps.mean(), rel=1e-9)
 
     currents = np.array([env.task.currents[i % 2] for i in range(5)])
-    voltages = np.array([episode.voltages(i + 1, currents[i], env.world) for i in range(5)])
+    voltages = cycle_voltages(env.world, 4, cached_episode(env.world, 4))
 
     def misfit(level):
         computed = env.task.observation.voltages(np.full(1701, level), currents)

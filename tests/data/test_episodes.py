@@ -1,7 +1,6 @@
 """Episodes: the truth is reproducible to the last bit, and finer than the estimators' model."""
 
 import hashlib
-import itertools
 import subprocess
 import sys
 from types import SimpleNamespace
@@ -45,17 +44,15 @@ def test_same_bits_in_this_process_from_the_cache_and_side_by_side(episode, monk
     assert bits(simulate(TINY, 7)) == bits(first) == bits(episode)
 
 
-def test_other_processes_same_bits_and_share_one_file(episode, place):
-    """Two processes that simulate and store one episode at once leave a single valid file with the bits made here."""
+def test_another_process_has_the_same_bits(episode, place):
+    """It leaves a single valid file with the bits made here."""
     program = ("from eitbench.worlds.catalogue import PIPE_2D\n"
                "from eitbench.data.episodes import simulate\n"
                "import hashlib\n"
                f"episode = simulate(PIPE_2D.with_changes({FAST!r}), 7)\n"
                "print(hashlib.sha256(b''.join(array.tobytes() for array in episode)).hexdigest())")
-    running = [subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE, text=True) for _ in range(2)]
-    digests = [process.communicate()[0].strip() for process in running]
-    here = hashlib.sha256(b"".join(array.tobytes() for array in episode)).hexdigest()
-    assert digests == [here, here]
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == hashlib.sha256(b"".join(array.tobytes() for array in episode)).hexdigest()
     assert len([path for path in place.rglob("*") if path.is_file()]) == 1
     assert bits(simulate(TINY, 7)) == bits(episode)
 
@@ -76,19 +73,6 @@ def test_seed_must_be_a_whole_number(seed):
             function(TINY, seed)
 
 
-def test_truth_is_finer_than_the_model():
-    """No inverse crime: six times the CD nodes, at least twice the EIT unknowns, a quarter of the sub-step."""
-    truth, model = cached_truth_model(PIPE_2D), PIPE_2D.estimator_model()
-    assert model.transport.mesh.n_nodes == 1701
-    assert truth.transport.mesh.n_nodes >= 6 * 1701
-    assert 3500 <= model.observation.cem.n_unknowns <= 5500
-    assert truth.observation.cem.n_unknowns >= 9000
-    step = model.transport.time_step
-    assert truth.transport.time_step * PIPE_2D.vessel.n_truth_steps == PIPE_2D.time_step == step
-    fine, coarse = (side.transport.time_step / side.transport.substeps for side in (truth, model))
-    assert fine <= coarse / 4
-
-
 def test_resistances_belong_to_the_concentrations(episode):
     """𝓡 at index t − 1 belongs to the concentration at t, on the truth's EIT mesh."""
     observation = cached_truth_model(TINY).observation
@@ -96,14 +80,6 @@ def test_resistances_belong_to_the_concentrations(episode):
         expected = observation.transfer_resistance(episode.concentration[t].astype(float))
         # Concentrations are stored in single precision, resistances as computed.
         np.testing.assert_allclose(episode.transfer_resistance[t - 1], expected, atol=1e-6 * np.abs(expected).max())
-
-
-def test_voltages_follow_the_noise_formula(episode):
-    """V = 𝓡I + std·n with std² = (1 % of the measurement)² + (0.1 % of the largest)², at the requested step."""
-    for step, currents in itertools.product((1, 2, 5), TINY.currents):
-        clean = episode.transfer_resistance[step - 1] @ currents
-        noisy = clean + np.sqrt((0.01 * clean)**2 + (0.001 * np.abs(clean).max())**2) * episode.noise[step - 1]
-        np.testing.assert_allclose(episode.voltages(step, currents, TINY), noisy, rtol=1e-12)
 
 
 def test_noise_is_standard_normal(monkeypatch):

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from eitbench.data import cache, presimulation
 from eitbench.data.cache import CACHE_VARIABLE, folder
-from eitbench.data.episode_cache import build_cached_episode, cached_episode, cached_episode_key, is_episode_cached
+from eitbench.data.episode_cache import build_cached_episode, cached_episode, is_episode_cached
 from eitbench.data.episodes import simulate, simulate_batch
 from eitbench.data.presimulation import MAX_EPISODES, EpisodeSampler, cached_episode_bytes, presimulate
 from eitbench.worlds import entry
@@ -22,8 +22,8 @@ from recorded import forget
 from short import DRAWN, PLAIN, shorten
 from tiny_worlds import TINY
 
-SEEDS = range(10)
-"""A full batch of eight and a remainder."""
+SEEDS = range(4)
+"""A full batch of `small_batches` and a remainder."""
 
 
 @pytest.fixture(autouse=True)
@@ -34,6 +34,12 @@ def place(tmp_path, monkeypatch):
     forget()
     yield folder(TINY)
     forget()
+
+
+@pytest.fixture
+def small_batches(monkeypatch):
+    """Simulate three episodes in a batch."""
+    monkeypatch.setattr(presimulation, "BATCH_SIZE", 3)
 
 
 @pytest.fixture(scope="module")
@@ -65,38 +71,42 @@ def stamps(place):
     return {path.name: (path.stat().st_ino, path.stat().st_mtime_ns) for path in place.iterdir()}
 
 
-@pytest.mark.parametrize("n_jobs", [1, 2])
-def test_recordings_have_the_bits_of_those_made_alone(n_jobs, place, alone, monkeypatch):
-    """Each cached episode belongs to its seed, in a batch of eight or in processes, and truths are not stored."""
+def test_recordings_have_the_bits_of_those_made_alone(place, alone, monkeypatch, tmp_path):
+    """Each cached episode belongs to its seed, and truths are not stored; if $EITBENCH_CACHE changes, existing workers
+    use the new folder."""
     get_reusable_executor().shutdown(wait=True)      # workers keep their initial cache folder
-    assert presimulate(TINY, SEEDS, n_jobs=n_jobs) == 10
+    assert presimulate(TINY, SEEDS, n_jobs=2) == 4
     assert names(place) == sorted(f"{seed}.npy" for seed in SEEDS)
     monkeypatch.setattr("eitbench.data.episode_cache.simulate", None)               # all are cached
     assert {seed: cached_episode(TINY, seed).tobytes() for seed in SEEDS} == alone
+    monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path / "other"))
+    forget()
+    assert presimulate(TINY, [0, 1], n_jobs=2) == 2
+    assert is_episode_cached(TINY, 0) and is_episode_cached(TINY, 1)
 
 
-def test_only_what_is_missing_is_made(place, asked, alone):
-    """Batches have eight episodes; duplicate seeds are simulated once, a damaged file counts as missing."""
+def test_only_what_is_missing_is_made(place, asked, alone, small_batches):
+    """Batches have a limited size; duplicate seeds are simulated once, a damaged file counts as missing."""
     cached_episode(TINY, 2)
     (place / "2.truth.npy").unlink()
     assert presimulate(TINY, [4, 2, 1, 4]) == 2 and asked == [[4, 1]]
     before = stamps(place)
     assert before.keys() == {"1.npy", "2.npy", "4.npy"}
     assert presimulate(TINY, [1, 2, 4]) == presimulate(TINY, []) == 0 and len(asked) == 1
-    assert presimulate(TINY, range(12)) == 9 and asked[1:] == [[0, 3, 5, 6, 7, 8, 9, 10], [11]]
+    assert presimulate(TINY, range(7)) == 4 and asked[1:] == [[0, 3, 5], [6]]
     assert {name: stamps(place)[name] for name in before} == before
-    path = cached_episode_key(TINY, 1).path
+    path = cache.episode_key(TINY, 1).path
     path.write_bytes(path.read_bytes()[:-1])
-    assert presimulate(TINY, range(12)) == 1 and asked[3:] == [[1]]
+    assert presimulate(TINY, range(7)) == 1 and asked[3:] == [[1]]
     assert {seed: cached_episode(TINY, seed).tobytes() for seed in SEEDS} == alone
 
 
-def test_interrupted_fill_keeps_what_is_done_and_resumes(place, asked, alone, monkeypatch):
-    """After Ctrl-C at the third episode, three are cached and valid, and the next call simulates the other seven."""
+def test_interrupted_fill_keeps_what_is_done_and_resumes(place, asked, alone, small_batches, monkeypatch):
+    """After Ctrl-C at the third episode, two are cached and valid, and the next call simulates the other two."""
     real = cache.store
 
     def interrupted(key, arrays):
-        if len(names(place)) == 3:
+        if len(names(place)) == 2:
             raise KeyboardInterrupt
         real(key, arrays)
 
@@ -106,20 +116,19 @@ def test_interrupted_fill_keeps_what_is_done_and_resumes(place, asked, alone, mo
         with pytest.raises(KeyboardInterrupt):
             presimulate(TINY, SEEDS)
     forget()
-    assert [seed for seed in SEEDS if is_episode_cached(TINY, seed)] == [0, 1, 2]
+    assert [seed for seed in SEEDS if is_episode_cached(TINY, seed)] == [0, 1]
     before = stamps(place)
-    assert presimulate(TINY, SEEDS) == 7 and asked[1] == [3, 4, 5, 6, 7, 8, 9]
+    assert presimulate(TINY, SEEDS) == 2 and asked[1] == [2, 3]
     assert {name: stamp for name, stamp in stamps(place).items() if name in before} == before
     assert {seed: cached_episode(TINY, seed).tobytes() for seed in SEEDS} == alone
 
 
-def test_predicted_size_is_that_of_the_files(place):
+def test_predicted_size_is_that_of_the_files():
     """The estimated size is accurate to 1 %, with integrals over a region."""
     region = PIPE_2D_DRIFTING.with_changes(DRAWN)
-    for each in (TINY, region):
-        presimulate(each, [0])
-        size = cached_episode_key(each, 0).path.stat().st_size
-        assert size == pytest.approx(cached_episode_bytes(each), rel=0.03)
+    presimulate(region, [0])
+    size = cache.episode_key(region, 0).path.stat().st_size
+    assert size == pytest.approx(cached_episode_bytes(region), rel=0.01)
     assert cached_episode_bytes(PIPE_2D) == pytest.approx(881_000, rel=0.01)
 
 
@@ -131,15 +140,6 @@ def test_fill_names_what_is_wrong(seed):
         presimulate(TINY, [1], n_jobs=0)
 
 
-def test_workers_write_where_the_parent_looks(monkeypatch, tmp_path):
-    """If $EITBENCH_CACHE changes between two calls, existing workers use the new folder."""
-    for name in ("one", "two"):
-        monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path / name))
-        forget()
-        presimulate(TINY, [0, 1], n_jobs=2)
-        assert is_episode_cached(TINY, 0) and is_episode_cached(TINY, 1), name
-
-
 def test_command_fills_and_resumes(place, asked, alone):
     """The command prints the numbers of new and cached episodes, and environments find them; dev:0 is not train:0."""
     code, said, _ = command("bank", "--seeds", "train:0-2", "-j", "1")
@@ -148,22 +148,22 @@ def test_command_fills_and_resumes(place, asked, alone):
     assert f"3 episodes, 0 MB in {place}" in said
     code, said, _ = command("bank", "--seeds", "train:0-3", "-j", "1", "--env", "eitbench/Pipe2DSmoothing-v0")
     assert code == 0 and "1 simulated, 3 were already stored" in said and asked == [[0, 1, 2], [3]]
-    assert {seed: cached_episode(TINY, seed).tobytes() for seed in range(4)} == {seed: alone[seed] for seed in range(4)}
+    assert {seed: cached_episode(TINY, seed).tobytes() for seed in SEEDS} == alone
     assert command("bank", "--seeds", "dev:0", "-j", "1")[0] == 0 and asked[2:] == [[100_000]]
 
 
 def test_full_disk_is_refused_before_anything_is_simulated(place, asked, monkeypatch):
     """One byte too few leads to exit code 2 and the required size; with enough it runs, and cached episodes
     need no space."""
-    free = [2 * cached_episode_bytes(TINY) - 1]
+    free = [cached_episode_bytes(TINY) - 1]
     monkeypatch.setattr(shutil, "disk_usage", lambda _: SimpleNamespace(free=free[0]))
-    code, said, complaint = command("bank", "--seeds", "train:0-1", "-j", "1")
+    code, said, complaint = command("bank", "--seeds", "train:0", "-j", "1")
     assert code == 2
     assert re.search("seeds need .* are free", complaint)
     assert "simulated" not in said
     assert asked == [] and names(place) == []
     free[0] += 1
-    for seeds, made in (("train:0-1", [0, 1]), ("train:0-3", [2, 3])):
+    for seeds, made in (("train:0", [0]), ("train:0-1", [1])):
         assert command("bank", "--seeds", seeds, "-j", "1")[0] == 0 and asked[-1] == made
 
 
@@ -198,7 +198,7 @@ def test_the_sequence_depends_on_the_seed_alone():
     def seen():
         env = gym.make("eitbench/Pipe2D-v0")
         env.reset(seed=1)
-        return [env.reset()[0] for _ in range(12)]
+        return [env.reset()[0] for _ in range(8)]
 
     first = seen()
     presimulate(TINY, SEEDS)

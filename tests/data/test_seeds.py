@@ -55,7 +55,7 @@ def test_errors_say_what_was_expected(text, message):
 
 
 def test_evaluations_leave_other_warnings_unchanged():
-    """The warning appears once per line of the user, and not within `allow_test_seeds`."""
+    """No warning of test seeds appears within `allow_test_seeds`."""
     with warnings.catch_warnings(record=True) as said:
         warnings.simplefilter("default")
         for _ in range(2):

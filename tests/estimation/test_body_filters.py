@@ -6,7 +6,8 @@ from functools import lru_cache
 import numpy as np
 import pytest
 from eitbench.bench.methods import builtin_methods, load_method
-from eitbench.data.episodes import cached_truth_model, simulate
+from eitbench.data.episode_cache import cached_episode, cycle_voltages
+from eitbench.data.episodes import cached_truth_model
 from eitbench.envs.injection_core import InjectionCore
 from eitbench.estimation.body_particles import SIGNAL_ERROR, BodyParticleFilter, BodyTracker, body_model
 from eitbench.estimation.onboard.belief import BodyBelief
@@ -145,10 +146,9 @@ def test_tracker_is_the_filter_of_an_episode():
     """NaN marks voltages that are not measured. Its moments are expectations of images, and of their squares, which are
     interpolated on the grid."""
     world = rules_of().world
-    task, episode = make_task(world), simulate(world, 3, progress=False)
+    task, measured = make_task(world), cycle_voltages(world, 3, cached_episode(world, 3))
     tracker, filters = BodyTracker(task), BodyParticleFilter(body_model(task), 1)
-    for k, currents in enumerate(task.currents):
-        voltages = episode.voltages(k + 1, currents, world)
+    for voltages, currents in zip(measured, task.currents, strict=False):
         assert np.isnan(voltages).sum() == 12
         tracker.assimilate(voltages, currents)
         filters.assimilate(voltages[None], currents[None], world.instrument.measurement_mask(currents)[None])

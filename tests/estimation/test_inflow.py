@@ -6,6 +6,7 @@ from functools import lru_cache
 import numpy as np
 import pytest
 from eitbench.bench.methods import baseline_folder
+from eitbench.data.episode_cache import cached_episode, cycle_voltages
 from eitbench.data.episodes import cached_truth_model, simulate
 from eitbench.data.seeds import parse_seeds
 from eitbench.estimation import (
@@ -40,9 +41,8 @@ def prior(link="logarithm"):
 
 def record():
     """Return (voltages, currents) of five injections."""
-    episode, cycle = simulate(TINY, 0), TINY.currents
-    currents = [cycle[t % len(cycle)] for t in range(TINY.n_steps)]
-    return [(episode.voltages(t + 1, I, TINY), I) for t, I in enumerate(currents)]
+    voltages = cycle_voltages(TINY, 0, cached_episode(TINY, 0))
+    return [*zip(voltages, TINY.currents[np.arange(TINY.n_steps) % len(TINY.currents)], strict=True)]
 
 
 def window(link="logarithm", lag=0, law=None):

@@ -10,6 +10,7 @@ from tanks import CONTACTS, SIGMA, VESSEL, homogeneous, instrument
 
 CURRENTS, MATRIX = instrument()
 ELECTRODES = read_vessel(VESSEL).electrode_model(1e-4)
+COARSE = read_vessel(VESSEL).shape.electrode_model(fine=False)
 
 
 def calibrate_tank(voltages, **options):
@@ -25,9 +26,9 @@ def test_parameters_are_recovered_from_exact_voltages():
 
 
 def test_reported_uncertainty_is_the_scatter_of_repetitions():
-    """Errors of ln σ and ln z over 12 noise realisations have the reported standard deviations."""
+    """Errors of ln σ and ln z over six noise realisations have the reported standard deviations."""
     errors = []
-    for seed in range(12):
+    for seed in range(6):
         calibration = calibrate_tank(homogeneous(noise=0.01, frames=2, seed=seed))
         errors.append([np.log(calibration.conductivity / SIGMA) / calibration.conductivity_std,
                     *np.log(calibration.contact_impedance / CONTACTS) / calibration.contact_impedance_std])
@@ -62,7 +63,7 @@ def test_gain_is_calibrated_if_the_conductivity_is_specified():
     (-homogeneous(), "voltages must have the sign of the model's"),
     (np.full((1, 8, 8), np.nan), "NaN only"),
     (np.zeros((1, 8, 8)), "voltages must differ from each other, got 0 V everywhere"),
-    (np.ones((1, 8, 7)), r"voltages must have shape \(F, K, M\)"),
+    (np.ones((1, 8, 7)), r"voltages must have shape \(any, 8, 8\)"),
 ])
 def test_invalid_voltages_are_rejected(voltages, message):
     with pytest.raises(ValueError, match=message):
@@ -92,7 +93,7 @@ DEAD[:, 4] = 0.5 * np.abs(homogeneous()).max() * np.random.default_rng(3).normal
 def test_contradictions_cause_warnings(voltages, currents, matrix, options, warning):
     """Valid measurements cause no warnings."""
     measurements = Measurements(currents, np.arange(8), matrix, voltages[0], np.arange(8.0))
-    calibration = calibrate(ELECTRODES, measurements.currents, matrix, voltages, **options)
-    warnings = " ".join(quality_warnings(measurements, calibration, ELECTRODES))
+    calibration = calibrate(COARSE, measurements.currents, matrix, voltages, **options)
+    warnings = " ".join(quality_warnings(measurements, calibration, COARSE))
     assert warning in warnings
     assert bool(warning) == bool(warnings)

@@ -12,6 +12,7 @@ from tanks import VESSEL, stationary
 
 from commands import eitbench
 
+pytestmark = pytest.mark.usefixtures("coarse")
 SIDE = ((np.arange(256) + 0.5) / 256 * 2.0 - 1.0) * 0.1
 X, Y = np.meshgrid(SIDE, -SIDE)
 
@@ -51,7 +52,7 @@ def test_equal_segmentations_score_one_and_others_less():
 
 
 @pytest.fixture(scope="module")
-def env():
+def env(coarse):
     return MeasuredEnv(stationary(), VESSEL, initial_std=0.5)
 
 
@@ -96,7 +97,7 @@ def test_command_scores_by_a_ground_truth(tmp_path):
     savemat(tmp_path / "truth.mat", {"truth": disk(0.05, 0.0, 0.02, 1)})
     (tmp_path / "tank.yml").write_text(yaml.safe_dump(VESSEL))
     arguments = ["estimate", tmp_path / "still.h5", "--baseline", "homogeneous", "--truth", tmp_path / "truth.mat",
-             "--vessel", tmp_path / "tank.yml", "--out", tmp_path / "page.html"]
+             "--still", "--vessel", tmp_path / "tank.yml", "--out", tmp_path / "page.html"]
     code, output, err = eitbench(*arguments)
     assert code == 0, err
     assert "KTC score" in output

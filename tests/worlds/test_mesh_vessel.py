@@ -90,9 +90,9 @@ def test_a_world_with_it_runs(files, vessel, monkeypatch, tmp_path):
     rewards = [env.step(level)[1] for _ in range(4)]
     assert all(-5.0 < reward < 0.0 for reward in rewards)
     cloudpickle.register_pickle_by_value(sys.modules[__name__])
-    for kind in ["process", *["bubblewrap"] * (not bubblewrap_problem())]:
-        with closing(Worker("estimation", "test/Meshed-v0", {}, write_baseline(tmp_path), kind)) as worker:
-            assert worker(None).update(np.zeros(8), np.zeros(8)).mean.shape == level.shape
+    kind = "process" if bubblewrap_problem() else "bubblewrap"
+    with closing(Worker("estimation", "test/Meshed-v0", {}, write_baseline(tmp_path), kind)) as worker:
+        assert worker(None).update(np.zeros(8), np.zeros(8)).mean.shape == level.shape
     gym.registry.pop("test/Meshed-v0")
 
 

@@ -1,16 +1,17 @@
 """Flows that are drawn for each episode: their distributions and the transport by them."""
 
+from functools import cache
+
 import numpy as np
 import pytest
-from eitbench.data import episodes
-from eitbench.data.episodes import cached_truth_model, simulate
+from eitbench.data.episodes import cached_truth_model
 from eitbench.physics.flow import PlaneChannelFlow
 from eitbench.worlds.catalogue import PIPE_2D_BIASED, PIPE_2D_SKEWED, PIPE_2D_TIME_VARYING, PIPE_2D_UNKNOWN
 from eitbench.worlds.random_streams import episode_streams
 from scipy.stats import kstest
 
 from short import DRAWN, FAST, merged
-from tiny_worlds import TINY
+from tiny_worlds import TINY, truths
 
 WORLDS = (PIPE_2D_BIASED, PIPE_2D_UNKNOWN, PIPE_2D_TIME_VARYING, PIPE_2D_SKEWED)
 each_world = pytest.mark.parametrize("world", WORLDS, ids=lambda world: world.name)
@@ -20,6 +21,13 @@ each_unknown = pytest.mark.parametrize("world", WORLDS[1:], ids=lambda world: wo
 def drawn(world, seed):
     """Return the flow of an episode."""
     return world.flow.draw(world, episode_streams(seed).flow)
+
+
+@cache
+def truth_of(world):
+    """Return the truth of a short episode of a world with seed 7, simulated alone."""
+    (truth,) = truths(world.with_changes(DRAWN), 7)
+    return truth
 
 
 def mean_velocities(world, seeds):
@@ -50,7 +58,7 @@ def test_the_task_specifies_another_velocity():
     assert np.abs(mean_velocities(PIPE_2D_BIASED, range(20)) - 4.5).mean() > 0.5
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", [2, 3])
 def test_mean_velocity_swings_as_a_sine(seed):
     """A least-squares fit finds v̄(t) as a constant plus a sine, with amplitude and period within their ranges."""
     world = PIPE_2D_TIME_VARYING
@@ -65,7 +73,7 @@ def test_mean_velocity_swings_as_a_sine(seed):
         factors = np.linalg.lstsq(waves, mean, rcond=None)[0]
         return np.abs(waves @ factors - mean).max(), factors
 
-    periods = np.linspace(0.35, 0.85, 5001)
+    periods = np.linspace(0.35, 0.85, 2501)
     misfit, (level, *wave) = min(map(fit, periods), key=lambda found: found[0])
     assert misfit < 1e-2 * level
     slowest, fastest = world.flow.velocity_range
@@ -84,27 +92,24 @@ def test_skewness_has_either_sign():
 
 
 def test_known_velocity_makes_the_episode_of_the_plain_pipe():
-    """Without randomness, and with the same spin-up, it equals `PIPE_2D`, with its inflow and noise, to rounding."""
+    """Without randomness, and with the same spin-up, it equals `PIPE_2D`, with its inflow, to rounding."""
     def of(velocity):
         return PIPE_2D_BIASED.with_changes(merged(FAST, {"flow": {"velocity_range": [velocity] * 2}}))
 
     world = of(45.0)
     assert world.spin_up_steps == TINY.spin_up_steps
     assert world.currents.tobytes() == TINY.currents.tobytes()
-    fixed, plain = (simulate(each, 7, cache=False) for each in (world, TINY))
-    np.testing.assert_allclose(fixed.concentration, plain.concentration, rtol=3e-7)     # of float32
-    scale = np.abs(plain.transfer_resistance).max()
-    np.testing.assert_allclose(fixed.transfer_resistance, plain.transfer_resistance, atol=1e-10 * scale)
-    np.testing.assert_array_equal(fixed.noise, plain.noise)
+    (fixed,), (plain,), (other,) = (truths(each, 7) for each in (world, TINY, of(44.0)))
+    np.testing.assert_allclose(fixed.concentration, plain.concentration, rtol=1e-9)
     assert fixed.velocity.shape == (5, 0)
-    other = simulate(of(44.0), 7, cache=False)
     assert np.abs(other.concentration - plain.concentration).max() > 0.1
 
 
 def test_slowest_fluid_flushes_the_pipe_before_the_start():
     """The slowest mean velocity, including the oscillation, passes the whole pipe in ``spin_up_steps`` steps."""
     for world in WORLDS:
-        lowest = min(drawn(world, seed)(t).mean_velocity for seed in range(50) for t in range(0, 100, 5))
+        flows = [drawn(world, seed) for seed in range(50)]
+        lowest = min(flow(t).mean_velocity for flow in flows for t in range(0, 100, 20))
         length = world.vessel.length
         assert world.spin_up_steps * world.time_step * lowest >= length * (1.0 - 1e-12)
         slowest = world.flow.velocity_range[0] * (1.0 - world.flow.oscillation_range[1])
@@ -113,9 +118,10 @@ def test_slowest_fluid_flushes_the_pipe_before_the_start():
 
 @each_unknown
 def test_recorded_flow_is_the_drawn_one(world):
-    """`Episode.velocity` is the profile at `VelocityModel.points` in the middle of each step, with the drawn mean."""
+    """`TruthTrajectory.velocity` is the profile at `VelocityModel.points` in the middle of each step, with the drawn
+    mean."""
+    velocity = truth_of(world).velocity
     world = world.with_changes(DRAWN)
-    velocity = simulate(world, 7, cache=False).velocity
     model = world.velocity_model
     assert velocity.shape == (5, 24)
     flow = drawn(world, 7)
@@ -132,10 +138,9 @@ def test_recorded_flow_is_the_drawn_one(world):
 
 def test_recorded_flow_is_the_one_that_carries():
     """The truth's two transport steps with the cached mean velocity give the next cached state to rounding."""
-    world = PIPE_2D_TIME_VARYING.with_changes(DRAWN)
+    history, world = truth_of(PIPE_2D_TIME_VARYING), PIPE_2D_TIME_VARYING.with_changes(DRAWN)
     half_width = world.vessel.half_width
     truth = cached_truth_model(world)
-    (history,) = world.evolve([episode_streams(7)], truth, lambda _: None)
     inflow = world.target.draw_inflow(world, episode_streams(7).inflow)
     model = world.velocity_model
     inlet = truth.transport.mesh.points[truth.transport.inlet]
@@ -154,7 +159,7 @@ def test_a_reference_is_given_the_flow_that_carries(world):
     """The true transport is bit-identical to a step on the estimator mesh with the flow drawn for that step."""
     world = world.with_changes(DRAWN)
     model, flow = world.estimator_model(), drawn(world, 7)
-    transport_at = world.true_transport(model, episode_streams(7).flow)
+    transport_at = world.flow.true_transport(world, model, episode_streams(7).flow)
     c = 30.0 + np.random.default_rng(0).normal(size=model.transport.mesh.n_nodes)
     for t in (1, 2, 5):
         real = model.transport.with_velocity(flow(t))
@@ -163,9 +168,7 @@ def test_a_reference_is_given_the_flow_that_carries(world):
 
 def test_simulated_together_same_bits():
     """Episodes with different flows are simulated one by one, with the same results as alone."""
-    world = PIPE_2D_TIME_VARYING.with_changes(DRAWN)
-    together = list(episodes.simulate_batch(world, [8, 7], progress=False))
-    alone = [simulate(world, seed, cache=False) for seed in (8, 7)]
-    for one, other in zip(together, alone, strict=True):
-        assert [array.tobytes() for array in one] == [array.tobytes() for array in other]
-    assert np.abs(together[0].concentration - together[1].concentration).max() > 0.1
+    other, one = truths(PIPE_2D_TIME_VARYING.with_changes(DRAWN), 8, 7)
+    alone = truth_of(PIPE_2D_TIME_VARYING)
+    assert [array.tobytes() for array in one] == [array.tobytes() for array in alone]
+    assert np.abs(one.concentration - other.concentration).max() > 0.1

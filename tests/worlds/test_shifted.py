@@ -15,7 +15,7 @@ from eitbench.worlds.catalogue import (
     PIPE_2D_SHORT_SLUGS,
     PIPE_2D_STRONG_SLUGS,
 )
-from eitbench.worlds.instrument import Faults, Instrument
+from eitbench.worlds.instrument import Instrument
 from eitbench.worlds.random_streams import episode_streams
 from eitbench.worlds.task import make_task
 from eitbench.worlds.vessels import PlanePipe, RoundPipe
@@ -98,7 +98,7 @@ def test_measurements_have_twice_the_specified_noise():
     clean = (resistance @ currents[..., None])[..., 0]
     for floor in (0.0, 3.0):
         instrument = Instrument(noise_floor=floor, noise_mismatch=2.0)
-        read = instrument.measure(Faults.none(16), np.arange(2000), resistance, currents, draws)
+        read = instrument.measure(instrument.draw(random, 16, 2000), np.arange(2000), resistance, currents, draws)
         told = instrument.model_noise.std(clean)
         assert np.std((read - clean) / told) == pytest.approx(2.0, rel=0.02)
     here, there = small(SHIFTS[2]), small(NOMINAL_ID)
@@ -112,16 +112,15 @@ def test_measurements_have_twice_the_specified_noise():
     np.testing.assert_allclose(read - clean, 2.0 * task.noise.std(clean) * entries["noise"], rtol=1e-9, atol=1e-15)
 
 
-@pytest.mark.parametrize("seed", [3, 4])
-def test_voltages_are_those_of_electrodes_with_these_contacts(seed):
+def test_voltages_are_those_of_electrodes_with_these_contacts():
     """Voltages equal a new complete electrode model with the drawn impedances, and differ from the task's."""
     shifted, home = small("eitbench/Pipe2DOtherContacts-v0"), small(NOMINAL_ID)
     assert shifted.instrument == PIPE_2D_OTHER_CONTACTS.instrument
     assert shifted.instrument.contact_impedance_spread == 0.5
-    episode, sound = (simulate(each, seed, cache=False) for each in (shifted, home))
+    episode, sound = (simulate(each, 3, cache=False) for each in (shifted, home))
     np.testing.assert_array_equal(episode.concentration, sound.concentration)
     told = shifted.vessel.contact_impedance
-    impedance = told * episode_streams(seed).contacts.uniform(0.5, 1.5, 4)
+    impedance = told * episode_streams(3).contacts.uniform(0.5, 1.5, 4)
     truth = cached_truth_model(home).observation
     sigma = truth.conductivity(truth.interpolation @ episode.concentration[2].astype(float))
     cem = truth.cem

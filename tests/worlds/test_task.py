@@ -126,8 +126,7 @@ def traces_of_truth(given, world):
             or (isinstance(thing, np.ndarray) and not fine.isdisjoint({*thing.shape, thing.size}))]
 
 
-@pytest.mark.parametrize("name", ["eitbench/Pipe2DFixedLag-v0", "eitbench/Pipe2DSkewedVelocity-v0",
-                                  "eitbench/RotatingTank2D-v0"])
+@pytest.mark.parametrize("name", ["eitbench/Pipe2DSkewedVelocity-v0", "eitbench/RotatingTank2D-v0"])
 def test_estimators_are_given_nothing_of_the_truth(name):
     """Task, observations and infos do not reveal the truth during an episode, or through caches and closures."""
     env = EstimationEnv(name, **world(name))
@@ -140,16 +139,13 @@ def test_estimators_are_given_nothing_of_the_truth(name):
     assert len([thing for thing in reachable(env.task) if isinstance(thing, np.ndarray)]) > 20
 
 
-@pytest.mark.parametrize("hide", [
-    lambda task, episode: replace(task, noise=episode),
-    lambda task, episode: replace(task, noise=lambda: episode),
-    lambda task, episode: replace(task, currents=[{"kept": (episode.concentration[1:],)}]),
-    lambda task, episode: replace(task, noise=functools.partial(max, TINY)),
-    lambda task, episode: replace(task, observation=cached_truth_model(TINY).observation),
-], ids=["attribute", "closure", "container", "world", "fine model"])
-def test_the_search_finds_what_is_hidden(hide):
-    """The search is effective: it finds a truth that is put into a task."""
-    assert traces_of_truth(hide(make_task(TINY), simulate(TINY, 3)), TINY)
+def test_the_search_finds_what_is_hidden():
+    """The search is effective: it finds a truth that is put into a task as an attribute or world, in a closure or
+    container, and a model on the truth's mesh."""
+    episode, fine = simulate(TINY, 3), cached_truth_model(TINY).observation
+    for hidden in ({"noise": episode}, {"noise": lambda: episode}, {"noise": functools.partial(max, TINY)},
+                   {"currents": [{"kept": (episode.concentration[1:],)}]}, {"observation": fine}):
+        assert traces_of_truth(replace(make_task(TINY), **hidden), TINY), hidden
 
 
 def test_wrong_belief_does_not_tell_the_right_one():

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from eitbench.data.episodes import simulate
+from eitbench.data.episodes import cached_truth_model
 from eitbench.estimation.body_particles import body_model
 from eitbench.estimation.onboard.rules import Rules
 from eitbench.worlds import entry
@@ -11,10 +11,12 @@ from eitbench.worlds.instrument import Instrument
 from eitbench.worlds.random_streams import episode_streams
 from eitbench.worlds.task import make_task
 
+from tiny_worlds import truths
+
 TRACKING, SEARCH = (entry(f"eitbench/{name}-v0").world for name in ("TankTracking", "SearchAndTrack"))
 
 
-def paths(world, count=60, n_steps=400):
+def paths(world, count=30, n_steps=400):
     long = world.with_changes({"schedule": {"scored_steps": n_steps}})
     return [long.target.path(long, episode_streams(seed).flow) for seed in range(count)]
 
@@ -60,13 +62,12 @@ def test_reflection_keeps_the_speed_and_ends_inside():
 
 
 def test_truth_is_the_body_on_its_path():
-    """Low concentration in the body, none of it when the body is absent; the cache has the same."""
+    """Low concentration in the body, none of it when the body is absent."""
     short = SEARCH.with_changes({"schedule": {"scored_steps": 40, "warm_up": 0}})
     seed = next(seed for seed in range(50) if not short.target.path(short, episode_streams(seed).flow).present.all())
     path = short.target.path(short, episode_streams(seed).flow)
-    episode = simulate(short, seed, cache=False)
-    points = short.truth_model().transport.mesh.points
-    for t, concentration in enumerate(episode.concentration):
+    points = cached_truth_model(short).transport.mesh.points
+    for t, concentration in enumerate(truths(short, seed)[0].concentration):
         expected = 30.0 - 28.5 * path.present[t] * disc_indicator(points, path.centres[t], path.radius, 0.003)
         np.testing.assert_allclose(concentration, expected, rtol=1e-6)
 

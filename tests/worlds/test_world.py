@@ -11,6 +11,8 @@ from eitbench.worlds.catalogue import PIPE_2D, PIPE_3D, ROTATING_TANK_2D, STATIO
 from eitbench.worlds.catalogue import PIPE_2D_TIME_VARYING as DRAWN
 from eitbench.worlds.random_streams import episode_streams, generator_from_state
 
+SMALL_3D = dataclasses.replace(PIPE_3D.vessel, electrode_rings=2, electrodes_per_ring=4)
+
 
 def test_only_what_is_named_changes():
     """Other components are the same objects; lists become tuples, and nested components can be changed."""
@@ -103,6 +105,20 @@ def test_a_part_without_what_its_protocol_asks_for_is_refused(name, part, messag
     """The message names the part, what came and what is missing."""
     with pytest.raises(ValueError, match=message):
         dataclasses.replace(PIPE_2D, **{name: part})
+
+
+@pytest.mark.parametrize(("vessel", "nodes", "unknowns", "substeps"), [
+    (PIPE_2D.vessel, 6, 2, 4), (SMALL_3D, 4, 1.8, 2), (STATIONARY_TANK_2D.vessel, 3, 2, 1)])
+def test_truth_is_finer_than_the_model(vessel, nodes, unknowns, substeps):
+    """No inverse crime: more transport nodes, unknowns and sub-steps; voltages differ by 1e-6 … 1 %."""
+    meshes = [vessel.transport_mesh(fine)[0] for fine in (True, False)]
+    models = [vessel.electrode_model(fine) for fine in (True, False)]
+    assert meshes[0].n_nodes > nodes * meshes[1].n_nodes
+    assert models[0].n_unknowns > unknowns * models[1].n_unknowns
+    assert vessel.n_truth_steps * vessel.substeps(True) >= substeps * vessel.substeps(False)
+    if meshes[0].dim == 2:
+        fine, coarse = (model.transfer_resistance(np.full(len(model.mesh.points), 0.3)) for model in models)
+        assert 1e-6 < np.abs(fine - coarse).max() / np.abs(fine).max() < 1e-2
 
 
 def test_a_generator_goes_on_from_a_state():
