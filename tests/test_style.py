@@ -9,14 +9,14 @@ import pytest
 
 ROOT = Path(__file__).parent.parent
 PACKAGE = ROOT / "eitbench"
-BUDGETS = {"numerics": 1684, "scoring": 107, "physics": 1642, "worlds": 3065, "data": 1637, "estimation": 6335,
-           "measured": 2024, "envs": 1750, "bench": 5095, "report": 3151, "rl": 839, "cli": 1037}
+BUDGETS = {"numerics": 1597, "scoring": 107, "physics": 1613, "worlds": 2703, "data": 1496, "estimation": 6228,
+           "measured": 1966, "envs": 1528, "bench": 4843, "report": 2921, "rl": 833, "cli": 1031}
 """Package (or module) -> lines of Python allowed, blank lines and docstrings included. Each imports only from those
 before it."""
 TOP = 443
 """Lines allowed in the other modules at the top: public names, argument checks, files, messages."""
-BASELINES = 2138
-TESTS = 20_773
+BASELINES = 1826
+TESTS = 19_375
 MODULES = {".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__"): path
            for path in PACKAGE.rglob("*.py")}
 

@@ -174,8 +174,8 @@ def subtrack_of_id(id: str, kwargs: Mapping[str, Any] = MappingProxyType({})) ->
     if track_of(id) == "injection":
         return "injection"
     from eitbench.envs.estimation import resolve_arguments
-    changes = (kwargs.get(name) for name in ("world", "lag", "assume"))
-    world, lag, _ = resolve_arguments(entry(id), *changes)
+    changes = {name: kwargs.get(name) for name in ("world", "lag", "assume")}
+    world, lag, _ = resolve_arguments(id, **changes)
     return _subtrack_of_lag(lag, world)
 
 

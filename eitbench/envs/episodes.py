@@ -132,9 +132,9 @@ class EpisodeCore(ABC):
         world = self.world
         truth = concentration_at(world, self.seeds[b], t, self.n_initial + 1)
         fields = [("truth", truth_mesh(world), truth), ("estimate", self.task.mesh, estimate)]
-        spread = ("no reported uncertainty", np.zeros(len(estimate))) if std is None \
-            else ("standard deviation of the estimate", std)
-        return draw_frame(self.task, fields, currents, t * world.time_step, spread, world.region)
+        title = "no reported uncertainty" if std is None else "standard deviation of the estimate"
+        return draw_frame(self.task, fields, currents, t * world.time_step, (title, std),
+                          world.region)
 
 
 def check_render_mode(render_mode: str | None) -> str | None:

@@ -182,7 +182,7 @@ class EstimationEnv(EpisodeEnv):
                  world: dict[str, Any] | None = None, lag: int | str | None = None,
                  assume: dict[str, Any] | None = None, episodes: int | None = None,
                  split: str = "train", render_mode: str | None = None) -> None:
-        core = make_core(name, variant, world, lag, assume)
+        core = EstimationCore(*resolve_arguments(name, variant, world, lag, assume))
         super().__init__(core, episodes, split, render_mode)
         self.lag = core.lag
         self.n_nodes = core.n_nodes
@@ -219,13 +219,15 @@ class EstimationVectorEnv(EpisodeVectorEnv):
 
     def __init__(self, name: str, *, num_envs: int = 1, episodes: int | None = None,
                  split: str = "train", render_mode: str | None = None, **arguments: Any) -> None:
-        super().__init__(make_core(name, **arguments), num_envs, episodes, split, render_mode)
+        super().__init__(EstimationCore(*resolve_arguments(name, **arguments)), num_envs, episodes,
+                         split, render_mode)
 
 
-def make_core(name: str, variant: str | None = None, world: dict[str, Any] | None = None,
-              lag: int | str | None = None, assume: dict[str, Any] | None = None) -> EstimationCore:
-    """Return the core of an id with these arguments; ``ValueError`` names an argument that is not
-    allowed."""
+def resolve_arguments(name: str, variant: str | None = None, world: dict[str, Any] | None = None,
+                      lag: int | str | None = None, assume: dict[str, Any] | None = None,
+                      ) -> tuple[World, int, dict[str, Any]]:
+    """Return the world, the lag and the assumptions on the flow of an id with these arguments;
+    ``ValueError`` names an argument that is not allowed."""
     registered = entry(name, variant)
     changed = registered.world.with_changes(world)
     assumed = registered.settings.get("assume", {}) if assume is None else assume
@@ -234,7 +236,7 @@ def make_core(name: str, variant: str | None = None, world: dict[str, Any] | Non
     if assumed:
         changed.flow.assumed_velocity(changed, **assumed)
     steps = lag_steps(changed, registered.settings.get("lag", 0) if lag is None else lag)
-    return EstimationCore(changed, steps, dict(assumed))
+    return changed, steps, dict(assumed)
 
 
 def check_actions(actions: Any, space: Any, n_nodes: int) -> np.ndarray:

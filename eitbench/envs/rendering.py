@@ -67,7 +67,7 @@ def draw_electrodes(axes: Axes, task: Task, currents: np.ndarray, width: float =
 
 
 def draw_frame(task: Task, fields: list[tuple[str, Mesh, np.ndarray]], currents: np.ndarray,
-               time: float, spread: tuple[str, np.ndarray] | None = None,
+               time: float, spread: tuple[str, np.ndarray | None] | None = None,
                region: tuple[float, float] | None = None) -> np.ndarray:
     """(height, width, 3) uint8: fields in one colour scale, and electrodes, at one time in s.
 
@@ -79,7 +79,7 @@ def draw_frame(task: Task, fields: list[tuple[str, Mesh, np.ndarray]], currents:
     fields : list of (title, mesh, (n,) in mol/m³ on the mesh)
     currents : (L,) A
     time : float, s
-    spread : (title, (n,) in mol/m³ on ``task.mesh``), optional
+    spread : (title, (n,) in mol/m³ on ``task.mesh``, or None if unknown), optional
         Standard deviation of the last field, for another panel.
     region : (float, float), optional
         Ends in m along a 2D pipe of the region of interest, drawn as lines.
@@ -96,16 +96,20 @@ def draw_frame(task: Task, fields: list[tuple[str, Mesh, np.ndarray]], currents:
         axes.set_title(fill(title, 34 if tank else 80), loc="left", fontsize=10 if tank else 11)
     figure.colorbar(mappable, ax=panels, extend="both", **bar,
                     label=f"concentration / (mol/m³) after {1e3 * time:.0f} ms")
-    if spread is not None:
-        title, std = spread
-        high = max(0.25, task.prior.initial_std) * task.expected_concentration
-        mappable = draw_field(panels[-1], task.mesh, std, 0.0, high, STD_COLORMAP)
-        panels[-1].set_title(title, loc="left", fontsize=10 if tank else 11)
-        figure.colorbar(mappable, ax=panels, extend="max", label="std / (mol/m³)", **bar)
     for axes in panels:
         axes.set(xticks=(), yticks=(), ylabel="")
         draw_electrodes(axes, task, currents)
         for end in region or ():
             axes.axvline(100 * end, color="white", linewidth=1.0, linestyle="--")
+    if spread is not None:
+        title, std = spread
+        high = max(0.25, task.prior.initial_std) * task.expected_concentration
+        colours = "Greys" if std is None else STD_COLORMAP                     # zero is white
+        mappable = draw_field(panels[-1], task.mesh, np.zeros(task.mesh.n_nodes)
+                              if std is None else std, 0.0, high, colours)
+        panels[-1].set_title(title, loc="left", fontsize=10 if tank else 11)
+        panels[-1].set(yticks=(), ylabel="", xlabel="current enters at the red electrode and "
+                       "leaves at the blue one" if not tank else "")
+        figure.colorbar(mappable, ax=panels, extend="max", label="std / (mol/m³)", **bar)
     canvas.draw()
     return np.asarray(canvas.buffer_rgba())[..., :3].copy()

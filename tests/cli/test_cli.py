@@ -76,7 +76,7 @@ def test_every_subtrack_by_default(tmp_path):
     """Without environments an estimator has a job in every environment of the quick suite of its subtracks."""
     (tmp_path / "mine.py").write_text(MINE.replace("class Estimator:", "class Estimator:\n"
                                                    "    subtracks = ('filter', 'smoothing')"))
-    jobs = suites.make_jobs("estimation", [], ["mine.py"], [1], suite="quick")
+    jobs = run.make_jobs("estimation", [], ["mine.py"], [1], suite="quick")
     assert [job.environment.id for job in jobs] == [PIPE, "eitbench/Pipe2DSmoothing-v0"]
 
 
