@@ -101,7 +101,7 @@ def test_an_unknown_velocity_is_estimated(pipe):
     velocity = run_on_measurements(env, "joint_inflow_filter").velocity
     assert velocity.shape == (len(pipe.voltages), 1)
     assert velocity[-1, 0] == pytest.approx(4.5, abs=0.3)
-    with pytest.raises(ValueError, match="advected by a flow that is estimated, got log_walk_filter"):
+    with pytest.raises(ValueError, match="must suit vessel, flow and target of the measurements, got log_walk_filter"):
         run_on_measurements(env, "log_walk_filter")
 
 

@@ -177,8 +177,15 @@ def test_failed_estimates_are_in_evaluations(monkeypatch):
         def predict(self, *_, **__):
             return np.zeros(2, dtype=int), None
 
-    errors, factors = InjectionVectorEnv.errors, iter([*[[1, 1]] * 6, [1, np.nan]])
-    monkeypatch.setattr(InjectionVectorEnv, "errors", lambda self: errors(self) * next(factors))
+    step = InjectionVectorEnv.step
+
+    def fail_at_the_end(env, actions):
+        *rest, ended, truncated, info = step(env, actions)
+        if ended.any():
+            info["error"][1] = np.nan
+        return *rest, ended, truncated, info
+
+    monkeypatch.setattr(InjectionVectorEnv, "step", fail_at_the_end)
     assert list(np.isnan(training.make_evaluator(NAME, SHORT, TINY)(Still())[0])) == [False, True]
 
 
