@@ -9,7 +9,7 @@ import pytest
 
 ROOT = Path(__file__).parent.parent
 PACKAGE = ROOT / "eitbench"
-BUDGETS = {"numerics": 1597, "scoring": 107, "physics": 1613, "worlds": 2703, "data": 1496, "estimation": 6228,
+BUDGETS = {"numerics": 1608, "scoring": 107, "physics": 1613, "worlds": 2703, "data": 1496, "estimation": 6230,
            "measured": 1966, "envs": 1528, "bench": 4843, "report": 2921, "rl": 833, "cli": 1031}
 """Package (or module) -> lines of Python allowed, blank lines and docstrings included. Each imports only from those
 before it."""

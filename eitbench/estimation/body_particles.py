@@ -248,8 +248,10 @@ class BodyParticleFilter:
         """Return the expectation (B, m) of functionals of the body to the power of ``moment``."""
         if self._density is None:
             self._density = self._densities()
-        # rounding of products with the result depends on its memory layout
-        return np.ascontiguousarray((images.power(moment) @ self._density[moment - 1].T).T)
+        found = np.zeros((len(self.weights), images.shape[0]))
+        compiled_kernels().add_columns(images.indptr, images.indices, images.data**moment,
+                                       self._density[moment - 1], found)
+        return found
 
     def body(self) -> np.ndarray:
         """Return the estimated `BODY` of each episode, (B, 9)."""

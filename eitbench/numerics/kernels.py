@@ -514,6 +514,17 @@ def particle_likelihoods(signals, index, shares, weights, currents, electrodes, 
 
 
 @njit(cache=True)
+def add_columns(pointers, rows, values, weights, totals):
+    """Add a sparse matrix by columns times ``weights`` (B, columns), of which most are zero, to
+    ``totals`` (B, rows)."""
+    for b in range(len(weights)):
+        for j in range(weights.shape[1]):
+            if weights[b, j] != 0.0:
+                for e in range(pointers[j], pointers[j + 1]):
+                    totals[b, rows[e]] += weights[b, j] * values[e]
+
+
+@njit(cache=True)
 def scatter(index, values, totals):
     """Add ``values`` (B, N) to ``totals`` (B, G) at ``index`` (B, N)."""
     for b in range(len(index)):
