@@ -515,7 +515,7 @@ def particle_likelihoods(signals, index, shares, weights, currents, electrodes, 
 
 @njit(cache=True)
 def add_columns(pointers, rows, values, weights, totals):
-    """Add a sparse matrix by columns times ``weights`` (B, columns), of which most are zero, to
+    """Add a sparse matrix by columns times ``weights`` (B, columns), most of them zero, to
     ``totals`` (B, rows)."""
     for b in range(len(weights)):
         for j in range(weights.shape[1]):
