@@ -284,7 +284,7 @@ def _load(track: str, id: str, kwargs: str, method: str, isolation: str, path: P
     if built_in is not None and methods.builtin_sha256(built_in) != worker.sha256:
         raise ValueError(f"{path} has the name of a built-in method, {name}, under which "
                          "results are stored; rename it")
-    return methods.checked_method(track, name, str(path), worker, about)._replace(
+    return methods.method_from_attributes(track, name, str(path), worker, about)._replace(
         title=about["title"], path=path, sha256=worker.sha256)
 
 

@@ -332,10 +332,10 @@ def method_from_class(method: type[Any], track: str, name: str, where: str = "")
              if hasattr(method, key)}
     if hasattr(method, "boards"):           # name of `subtracks` in older files
         given.setdefault("subtracks", method.boards)
-    return checked_method(track, name, who, method, given)
+    return method_from_attributes(track, name, who, method, given)
 
 
-def checked_method(track: str, name: str, who: str, make: Callable[..., Any],
+def method_from_attributes(track: str, name: str, who: str, make: Callable[..., Any],
                    given: Mapping[str, Any]) -> Method:
     """Return a method with the ``given`` attributes of its class, without a file. ``ValueError``,
     naming ``who`` has them, if they are invalid."""

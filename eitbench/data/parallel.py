@@ -5,10 +5,13 @@ from __future__ import annotations
 import io
 import os
 import sys
+import time
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import nullcontext, redirect_stderr
+from functools import lru_cache
+from threading import Thread
 from typing import Any, TypeVar
 
 from tqdm import tqdm
@@ -57,7 +60,8 @@ def _with_joblib(function: Callable[..., Result], arguments: Sequence[tuple], n_
     try:
         with config or nullcontext(), Parallel(n_jobs=n_jobs, **options) as parallel:
             entries = runtime_entries()
-            yield from parallel(delayed(_run_single_threaded)(entries, function, *each)
+            pid = os.getpid()
+            yield from parallel(delayed(_run_with_parent_watchdog)(pid, entries, function, *each)
                                 for each in arguments)
     except lost as error:
         raise _worker_lost_error(error) from error
@@ -106,6 +110,26 @@ def _worker_lost_error(error: BaseException) -> WorkerLostError:
     return WorkerLostError(f"a worker process was lost ({type(error).__name__}), possibly killed "
                            "for lack of memory; finished results are stored, and the same command "
                            "resumes")
+
+
+def _run_with_parent_watchdog(parent: int, entries: list[Entry], function: Callable[..., Result],
+                              *arguments: Any) -> Result:
+    """Call `_run_single_threaded` in a process that ends soon after its ``parent``."""
+    if os.getppid() == parent:
+        _exit_when_parent_dies(parent)
+    return _run_single_threaded(entries, function, *arguments)
+
+
+@lru_cache(maxsize=1)
+def _exit_when_parent_dies(parent: int) -> None:
+    """End this process within a second of its parent. (The signal of Linux would arrive when the
+    starting thread ends.)"""
+    def watch() -> None:
+        while os.getppid() == parent:
+            time.sleep(1.0)
+        os._exit(1)
+
+    Thread(target=watch, daemon=True, name="parent watchdog").start()
 
 
 def _run_capturing_stderr(entries: list[Entry], function: Callable[..., Result],

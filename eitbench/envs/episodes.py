@@ -7,12 +7,14 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from copy import copy
+from dataclasses import replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
+from gymnasium.envs.registration import EnvSpec
 from gymnasium.utils import seeding
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
@@ -137,6 +139,28 @@ class EpisodeCore(ABC):
                           world.region)
 
 
+class FixedLengthEnv(gym.Env[Any, Any]):  # type: ignore[misc]
+    """An environment whose ``spec`` states the steps of its episodes as ``max_episode_steps``.
+
+    The last step is ``terminated``, and ids are registered without that number, so
+    `gymnasium.make` adds no `gymnasium.wrappers.TimeLimit`. An environment made from this spec has
+    one, whose last step is ``truncated`` too (``gymnasium.make(spec, max_episode_steps=-1)`` leaves
+    it out).
+    """
+
+    episode_steps: int
+    _spec: EnvSpec | None = None
+
+    @property
+    def spec(self) -> EnvSpec | None:
+        """Specification that the environment was made from."""
+        return self._spec
+
+    @spec.setter
+    def spec(self, made_from: EnvSpec | None) -> None:
+        self._spec = made_from and replace(made_from, max_episode_steps=self.episode_steps)
+
+
 def check_render_mode(render_mode: str | None) -> str | None:
     """Return the render mode; ``ValueError`` if it does not exist."""
     if render_mode not in (None, *RENDER_MODES):
@@ -155,7 +179,7 @@ def can_render(env: Any) -> bool:
     return True
 
 
-class EpisodeEnv(gym.Env[Any, Any]):  # type: ignore[misc]
+class EpisodeEnv(FixedLengthEnv):
     """One episode of a core at a time."""
 
     metadata = {"render_modes": RENDER_MODES, "render_fps": 8}  # noqa: RUF012 (gymnasium's form)
@@ -238,7 +262,11 @@ class EpisodeVectorEnv(gym.vector.VectorEnv[Any, np.ndarray, np.ndarray]):
                 "autoreset_mode": AutoresetMode.NEXT_STEP}
 
     def __init__(self, core: EpisodeCore, num_envs: int, episodes: int | None, split: str,
-                 render_mode: str | None, threads: int = 1) -> None:
+                 render_mode: str | None, max_episode_steps: int | None,
+                 threads: int = 1) -> None:
+        if max_episode_steps not in (None, core.length):       # gymnasium passes the spec's value
+            raise ValueError("max_episode_steps must be None or the steps of an episode, "
+                             f"{core.length}, got {max_episode_steps!r}")
         self.render_mode = check_render_mode(render_mode)
         self.num_envs = _check.integer("num_envs", num_envs, low=1)
         self.pool = EpisodeSampler(episodes, split)

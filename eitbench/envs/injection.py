@@ -100,9 +100,9 @@ class InjectionVectorEnv(EpisodeVectorEnv):
 
     def __init__(self, name: str, *, num_envs: int = 1, episodes: int | None = None,
                  split: str = "train", render_mode: str | None = None, threads: int = 1,
-                 **arguments: Any) -> None:
+                 max_episode_steps: int | None = None, **arguments: Any) -> None:
         core = make_core(name, **arguments)
-        super().__init__(core, num_envs, episodes, split, render_mode, threads)
+        super().__init__(core, num_envs, episodes, split, render_mode, max_episode_steps, threads)
         self.rules = core.rules
 
     def action_masks(self) -> np.ndarray:

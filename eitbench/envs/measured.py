@@ -16,6 +16,7 @@ from eitbench._extras import require_extra
 from eitbench.envs.episodes import (
     RENDER_MODES,
     RESET_NEEDED,
+    FixedLengthEnv,
     Observation,
     can_render,
     check_render_mode,
@@ -43,7 +44,7 @@ WITHHOLDING_SEEDS = 100_000
 """Size of a split of seeds: ``test:3``, ``dev:3`` and ``train:3`` share their withheld mask."""
 
 
-class MeasuredEnv(gym.Env[Observation, np.ndarray]):  # type: ignore[misc]
+class MeasuredEnv(FixedLengthEnv):
     """Estimate the concentration in a real vessel from measurements, without ground truth.
 
     ## Action Space

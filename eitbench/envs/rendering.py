@@ -80,36 +80,48 @@ def draw_frame(task: Task, fields: list[tuple[str, Mesh, np.ndarray]], currents:
     currents : (L,) A
     time : float, s
     spread : (title, (n,) in mol/m³ on ``task.mesh``, or None if unknown), optional
-        Standard deviation of the last field, for another panel.
+        Standard deviation of the last field, for another panel; in 3D isosurfaces of the fields are
+        added too.
     region : (float, float), optional
         Ends in m along a 2D pipe of the region of interest, drawn as lines.
     """
     tank = task.vessel is not None and not task.vessel.is_elongated
+    in_space = task.mesh.dim == 3 and spread is not None
     count = len(fields) + (spread is not None)
-    figure = Figure((3.0 * count, 3.6) if tank else (7.2, 1.85 * count + 0.5), dpi=100,
-                    layout="constrained")
+    figure = Figure((3.0 * count, 3.6) if tank else (7.2 + 3.6 * in_space, 1.85 * count + 0.5),
+                    dpi=100, layout="constrained")
     canvas = FigureCanvasAgg(figure)
-    panels = list(figure.subplots(*((1, count) if tank else (count, 1)), squeeze=False).flat)
+    grid = figure.subplots(*((1, count) if tank else (count, 1 + in_space)), squeeze=False)
+    panels = list(grid[0] if tank else grid[:, 0])
+    size = 10 if tank else 11
     bar: dict[str, Any] = {"location": "bottom", "aspect": 50, "shrink": 0.8}
     for axes, (title, mesh, values) in zip(panels, fields, strict=False):
         mappable = draw_field(axes, mesh, values, *colour_range(task))
-        axes.set_title(fill(title, 34 if tank else 80), loc="left", fontsize=10 if tank else 11)
+        axes.set_title(fill(title, 34 if tank else 80), loc="left", fontsize=size)
     figure.colorbar(mappable, ax=panels, extend="both", **bar,
                     label=f"concentration / (mol/m³) after {1e3 * time:.0f} ms")
+    if spread is not None:
+        title, std = spread
+        shown = np.zeros(task.mesh.n_nodes) if std is None else std
+        high = max(0.25, task.prior.initial_std) * task.expected_concentration
+        mappable = draw_field(panels[-1], task.mesh, shown, 0.0, high,
+                              "Greys" if std is None else STD_COLORMAP)        # zero is white
+        panels[-1].set_title(fill(title, 28 if tank else 80), loc="left", fontsize=size)
+        figure.colorbar(mappable, ax=panels, extend="max", label="std / (mol/m³)", **bar)
+        figure.suptitle("current enters at the red electrode and leaves at the blue one",
+                        fontsize=size)
+    if in_space:
+        from eitbench.envs.isosurface import draw_isosurfaces
+        levels = 1.08 * task.expected_concentration, 1.36 * task.expected_concentration
+        for axes, (_, mesh, values) in zip(grid[:, 1], fields, strict=False):
+            draw_isosurfaces(axes, mesh, values, *levels)
+            axes.set_title("{:.0f} (blue) and {:.0f} (orange) mol/m³".format(*levels),
+                           fontsize=size)
+        grid[-1, 1].set_axis_off()
     for axes in panels:
         axes.set(xticks=(), yticks=(), ylabel="")
         draw_electrodes(axes, task, currents)
         for end in region or ():
             axes.axvline(100 * end, color="white", linewidth=1.0, linestyle="--")
-    if spread is not None:
-        title, std = spread
-        high = max(0.25, task.prior.initial_std) * task.expected_concentration
-        colours = "Greys" if std is None else STD_COLORMAP                     # zero is white
-        mappable = draw_field(panels[-1], task.mesh, np.zeros(task.mesh.n_nodes)
-                              if std is None else std, 0.0, high, colours)
-        panels[-1].set_title(title, loc="left", fontsize=10 if tank else 11)
-        panels[-1].set(yticks=(), ylabel="", xlabel="current enters at the red electrode and "
-                       "leaves at the blue one" if not tank else "")
-        figure.colorbar(mappable, ax=panels, extend="max", label="std / (mol/m³)", **bar)
     canvas.draw()
     return np.asarray(canvas.buffer_rgba())[..., :3].copy()

@@ -15,7 +15,6 @@ from eitbench import _check
 from eitbench.measured.readers import load_yaml
 from eitbench.numerics.mesh import Mesh
 from eitbench.physics.cem import CompleteElectrodeModel
-from eitbench.worlds.flows import LaminarFlow
 from eitbench.worlds.vessels import MAX_COVERAGE, MeshVessel, PlanePipe, RoundPipe, RoundTank
 
 NUMBERING_DIRECTIONS = ("counter-clockwise", "clockwise")
@@ -32,16 +31,21 @@ VESSEL_ENTRIES = {
 
 
 @dataclass(frozen=True)
-class FlowConfig(LaminarFlow):
-    """Laminar flow along a pipe, whose velocity may be estimated."""
+class FlowConfig:
+    """Laminar flow along a pipe."""
 
+    mean_velocity: float
+    """m/s, along the pipe"""
+    diffusivity: float = 5e-4
+    """κ in m²/s"""
     velocity_std: float = 0.0
     """m/s, prior of the mean velocity; if positive, the velocity is estimated too"""
     velocity_walk: float = 0.0
     """m/s, standard deviation of the mean velocity's random walk in a step"""
 
     def __post_init__(self) -> None:
-        super().__post_init__()
+        for name, units in (("mean_velocity", "m/s"), ("diffusivity", "m²/s")):
+            _check.number(f"flow.{name}", getattr(self, name), low=0.0, open_low=True, units=units)
         for name in ("velocity_std", "velocity_walk"):
             _check.number(f"flow.{name}", getattr(self, name), low=0.0, units="m/s")
 

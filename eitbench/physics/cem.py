@@ -98,7 +98,8 @@ class CompleteElectrodeModel:
         size = self._system.batch
         result = np.concatenate([self._system.port_inverse(self._assemble(flat[k:k + size].T))
                                  for k in range(0, len(flat), size)])
-        return self._centred(result).reshape(*sigma.shape[:-1], *self._centre.shape[:1] * 2)
+        shape = (*sigma.shape[:-1], self.n_electrodes, self.n_electrodes)
+        return self._centred(result).reshape(shape)
 
     def voltages(self, conductivity: np.ndarray, currents: np.ndarray) -> np.ndarray:
         """Potentials (K, L) in V for currents (K, L) in A (A/m in 2D); rows of both sum to zero."""

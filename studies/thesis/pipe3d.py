@@ -8,6 +8,7 @@ from matplotlib.figure import Figure
 
 from eitbench.data.episode_cache import truth_mesh
 from eitbench.envs.estimation import EstimationEnv
+from eitbench.envs.isosurface import draw_isosurfaces
 from eitbench.envs.rendering import colour_range, draw_field
 
 from .common import (
@@ -18,7 +19,6 @@ from .common import (
     run_baseline,
     save_figure,
 )
-from .isosurface import draw_isosurfaces
 
 
 def fig5_10(seeds: list[int], _jobs: int, out: Path) -> tuple[Path, str]:

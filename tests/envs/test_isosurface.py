@@ -1,15 +1,10 @@
 """Isosurfaces have the position and the area of the interpolant's level sets."""
 
-import sys
-from importlib import import_module
-from pathlib import Path
-
 import numpy as np
 import pytest
+from eitbench.envs.isosurface import isosurface
 from eitbench.numerics.round_meshes import extrude, uniform_disc
 
-sys.path.append(str(Path(__file__).parents[2] / "studies"))
-isosurface = import_module("thesis.isosurface").isosurface
 MESH = extrude(uniform_disc(1.0, 8), np.linspace(-1.0, 1.0, 17))
 
 
