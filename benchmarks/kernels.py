@@ -1,6 +1,6 @@
 """Speed of the compiled kernels relative to scipy: `python benchmarks/run.py kernels`.
 
-The scipy implementation is in `benchmarks/references.py`.
+The scipy implementation is the reference of the tests, `tests/references.py`.
 """
 
 from __future__ import annotations

@@ -261,17 +261,18 @@ class EpisodeVectorEnv(gym.vector.VectorEnv[Any, np.ndarray, np.ndarray]):
     metadata = {"render_modes": RENDER_MODES, "render_fps": 8,  # noqa: RUF012
                 "autoreset_mode": AutoresetMode.NEXT_STEP}
 
-    def __init__(self, core: EpisodeCore, num_envs: int, episodes: int | None, split: str,
-                 render_mode: str | None, max_episode_steps: int | None,
+    def __init__(self, make_core: Callable[[], EpisodeCore], num_envs: int, episodes: int | None,
+                 split: str, render_mode: str | None, max_episode_steps: int | None,
                  threads: int = 1) -> None:
-        if max_episode_steps not in (None, core.length):       # gymnasium passes the spec's value
-            raise ValueError("max_episode_steps must be None or the steps of an episode, "
-                             f"{core.length}, got {max_episode_steps!r}")
         self.render_mode = check_render_mode(render_mode)
         self.num_envs = _check.integer("num_envs", num_envs, low=1)
         self.pool = EpisodeSampler(episodes, split)
         """episodes of unseeded resets"""
         self._threads = _check.integer("threads", threads, low=1)
+        core = make_core()
+        if max_episode_steps not in (None, core.length):       # gymnasium passes the spec's value
+            raise ValueError("max_episode_steps must be None or the steps of an episode, "
+                             f"{core.length}, got {max_episode_steps!r}")
         size = int(min(core.max_batch, -(-num_envs // threads)))
         self._parts = [slice(first, first + size) for first in range(0, num_envs, size)]
         self.cores: list[Any] = [copy(core) for _ in self._parts]

@@ -220,8 +220,8 @@ class EstimationVectorEnv(EpisodeVectorEnv):
     def __init__(self, name: str, *, num_envs: int = 1, episodes: int | None = None,
                  split: str = "train", render_mode: str | None = None,
                  max_episode_steps: int | None = None, **arguments: Any) -> None:
-        super().__init__(EstimationCore(*resolve_arguments(name, **arguments)), num_envs, episodes,
-                         split, render_mode, max_episode_steps)
+        super().__init__(lambda: EstimationCore(*resolve_arguments(name, **arguments)), num_envs,
+                         episodes, split, render_mode, max_episode_steps)
 
 
 def resolve_arguments(name: str, variant: str | None = None, world: dict[str, Any] | None = None,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -101,9 +102,9 @@ class InjectionVectorEnv(EpisodeVectorEnv):
     def __init__(self, name: str, *, num_envs: int = 1, episodes: int | None = None,
                  split: str = "train", render_mode: str | None = None, threads: int = 1,
                  max_episode_steps: int | None = None, **arguments: Any) -> None:
-        core = make_core(name, **arguments)
-        super().__init__(core, num_envs, episodes, split, render_mode, max_episode_steps, threads)
-        self.rules = core.rules
+        super().__init__(partial(make_core, name, **arguments), num_envs, episodes, split,
+                         render_mode, max_episode_steps, threads)
+        self.rules: Rules = self.cores[0].rules
 
     def action_masks(self) -> np.ndarray:
         """(num_envs, actions) as in `InjectionEnv`."""

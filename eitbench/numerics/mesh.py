@@ -191,6 +191,16 @@ def _tree(corner: np.ndarray) -> tuple[cKDTree, float]:
     return cKDTree(middle), float(np.linalg.norm(corner - middle[:, None], axis=2).max())
 
 
+def validate_facets(name: str, facets: np.ndarray, mesh: Mesh) -> np.ndarray:
+    """Return ``facets`` as node numbers (k ≥ 1, d); ``ValueError`` with their name otherwise."""
+    facets = np.asarray(facets)
+    if (facets.ndim != 2 or facets.shape[1] != mesh.dim or len(facets) == 0
+            or not np.issubdtype(facets.dtype, np.integer)):
+        raise ValueError(f"{name} must be integers of shape (n_facets ≥ 1, {mesh.dim}), "
+                         f"got {facets.dtype} of shape {facets.shape}")
+    return facets
+
+
 def facet_set(facets: np.ndarray) -> set[tuple[int, ...]]:
     """Return facets as tuples of node numbers."""
     return set(map(tuple, facets.tolist()))
@@ -232,13 +242,17 @@ def graded_interval(start: float, stop: float, cells: int, grading: float,
 
     ``grading`` is the exponent of the clustering, ≥ 1; 1 is uniform.
     """
+    _check.integer("cells", cells, low=1)
+    _check.number("grading", grading, low=1.0)
     s = np.linspace(0.0, 1.0, cells + 1)
     if ends == "both":
         s = np.where(s <= 0.5, 0.5 * (2 * s)**grading, 1.0 - 0.5 * (2 * (1 - s))**grading)
     elif ends == "start":
         s = s**grading
-    else:
+    elif ends == "stop":
         s = 1.0 - (1.0 - s)**grading
+    else:
+        raise ValueError(f"ends must be 'start', 'stop' or 'both', got {ends!r}")
     return start + (stop - start) * s
 
 

@@ -22,8 +22,8 @@ def disc_mesh(radii: Sequence[float] | np.ndarray, angles: Sequence[np.ndarray])
 
     Rings may have different numbers of nodes. Each edge of a ring forms a triangle with the node of
     the neighbouring ring whose sector contains the middle of the edge; the sector of a node extends
-    to the middles of its two edges. ``ValueError`` if neighbouring rings differ so much that
-    triangles overlap.
+    to the middles of its two edges. ``ValueError`` naming the argument if a shape or an order is
+    wrong, or if neighbouring rings differ so much that triangles overlap.
 
     Parameters
     ----------
@@ -32,7 +32,19 @@ def disc_mesh(radii: Sequence[float] | np.ndarray, angles: Sequence[np.ndarray])
     angles : K sequences of (n_k ≥ 3,) float
         Angles of each ring's nodes in rad, increasing and within one turn.
     """
-    rings = [np.asarray(ring) for ring in angles]
+    radii = _check.array("radii", radii, (None,), units="m", positive=True)
+    if len(radii) == 0 or (np.diff(radii) <= 0).any():
+        raise ValueError("radii must hold at least one radius in m, strictly increasing, "
+                         f"got {radii!r}")
+    if len(angles) != len(radii):
+        raise ValueError(f"angles must hold one sequence for each of the {len(radii)} radii, "
+                         f"got {len(angles)}")
+    rings = [_check.array(f"angles[{k}]", ring, (None,), units="rad")
+             for k, ring in enumerate(angles)]
+    for k, ring in enumerate(rings):
+        if len(ring) < 3 or (np.diff(ring) <= 0).any() or ring[-1] >= ring[0] + TWO_PI:
+            raise ValueError(f"angles[{k}] must hold at least three angles in rad, strictly "
+                             f"increasing and within one turn, got {ring!r}")
     polar = [r * np.stack([np.cos(ring), np.sin(ring)], axis=1)
              for r, ring in zip(radii, rings, strict=True)]
     points = np.concatenate([np.zeros((1, 2)), *polar])
@@ -76,6 +88,8 @@ def _node_at(middles: np.ndarray, angle: np.ndarray, side: str) -> np.ndarray:
 
 def uniform_disc(radius: float, rings: int) -> Mesh:
     """Return a uniform disc of ``radius`` (m): 6k nodes on ring k, 1 + 3·rings·(rings+1) in all."""
+    _check.number("radius", radius, low=0.0, open_low=True, units="m")
+    _check.integer("rings", rings, low=1)
     number = np.arange(1, rings + 1)
     return disc_mesh(radius * number / rings, [TWO_PI * np.arange(n) / n for n in 6 * number])
 
@@ -85,8 +99,9 @@ def electrode_disc(radius: float, spans: np.ndarray, cells_at_electrodes: int, r
     """Return an EIT mesh of a disc, refined at the electrode edges and the wall.
 
     Inner rings have fewer nodes, with a spacing similar to the distance of the rings and more
-    uniform than on outer rings. ``ValueError`` if electrodes touch or overlap, or if the wall has
-    cells so long that they intersect the rings next to it.
+    uniform than on outer rings. ``ValueError`` naming the argument if it is out of range, of the
+    wrong shape, or if electrodes touch or overlap; also if the wall has cells so long that they
+    intersect the rings next to it.
 
     Parameters
     ----------
@@ -104,6 +119,9 @@ def electrode_disc(radius: float, spans: np.ndarray, cells_at_electrodes: int, r
         voltage error at equal numbers of unknowns. Angles stay above 15° where the wall's cells are
         about as long as the rings next to them are wide.
     """
+    _check.number("radius", radius, low=0.0, open_low=True, units="m")
+    _check.integer("cells_at_electrodes", cells_at_electrodes, low=1)
+    _check.integer("rings", rings, low=1)
     around, across = grading
     edges = _check.array("spans", spans, (None, 2), units="rad").ravel()
     closed = [*edges, *(edges[:1] + TWO_PI)]
@@ -154,7 +172,8 @@ def round_pipe_mesh(length: float, radius: float, spans_around: np.ndarray,
                     grading: tuple[float, float, float] = (2.0, 1.5, 2.0)) -> Mesh:
     """Return an EIT mesh of a round pipe 0 ≤ z ≤ length, electrodes at all pairs of spans.
 
-    ``ValueError`` if electrodes touch or overlap.
+    ``ValueError`` naming the argument if it is out of range, of the wrong shape, or if electrodes
+    touch or overlap.
 
     Parameters
     ----------
@@ -172,6 +191,8 @@ def round_pipe_mesh(length: float, radius: float, spans_around: np.ndarray,
     grading : (float, float, float)
         Exponents of the refinement around, across and along the pipe, see `graded_interval`.
     """
+    _check.number("length", length, low=0.0, open_low=True, units="m")
     around, along = cells_at_electrodes
+    _check.integer("cells_at_electrodes[1]", along, low=1)
     z = graded_line(length, "spans_along", spans_along, along, grading[2])
     return extrude(electrode_disc(radius, spans_around, around, rings, grading[:2]), z)

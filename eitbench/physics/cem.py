@@ -20,7 +20,7 @@ from eitbench import _check
 from eitbench.numerics.condensation import Condensation
 from eitbench.numerics.fem import basis as basis_on
 from eitbench.numerics.fem import element, facet_numbers, integral, product
-from eitbench.numerics.mesh import Mesh, facet_set
+from eitbench.numerics.mesh import Mesh, facet_set, validate_facets
 from eitbench.physics.sensitivity import Sensitivity
 
 
@@ -253,14 +253,12 @@ def _checked_electrodes(mesh: Mesh, electrodes: Sequence[np.ndarray]) -> list[np
     checked = []
     for number, facets in enumerate(electrodes):
         name = f"electrodes[{number}]"
-        facets = np.asarray(facets)
-        if facets.shape != (max(len(facets), 1), mesh.dim) or facets.dtype.kind not in "iu":
-            raise ValueError(f"{name} must be integers of shape (n_facets ≥ 1, {mesh.dim}), "
-                             f"got {facets.dtype} of shape {facets.shape}")
-        facets = np.sort(facets, axis=1)
+        facets = np.sort(validate_facets(name, facets, mesh), axis=1)
         for facet in map(tuple, facets.tolist()):
             if facet not in boundary:
                 raise ValueError(f"{name} has facet {facet}, which is not on the mesh's boundary")
+            if owner.get(facet) == number:
+                raise ValueError(f"{name} holds facet {facet} twice")
             if facet in owner:
                 raise ValueError(f"{name} and electrodes[{owner[facet]}] overlap in facet {facet}")
             owner[facet] = number

@@ -16,7 +16,7 @@ from skfem.helpers import grad
 from eitbench import _check
 from eitbench.numerics.fem import basis as basis_on
 from eitbench.numerics.fem import facet_numbers, integral, laplace
-from eitbench.numerics.mesh import Mesh
+from eitbench.numerics.mesh import Mesh, facet_set, validate_facets
 from eitbench.physics.transport import VelocityField
 
 _EDGES = np.array([[0, 1], [1, 2], [2, 0]])  # of a triangle; their midpoints are its nodes 3, 4, 5
@@ -51,9 +51,9 @@ def steady_flow(mesh: Mesh, viscosity: float, walls: Sequence[tuple[np.ndarray, 
     norms). Terms are not upwinded: a mesh too coarse for the Reynolds number leads to oscillations
     or no solution. If several steady flows exist, the result is one of them, stable or not.
     ``ValueError`` naming the argument if the mesh is not 2D, if a value is out of range, of the
-    wrong shape or not finite, or if the net flux through closed walls exceeds 10⁻⁴ of the largest
-    speed times the perimeter. (A smaller flux is interpolation error, and distributed as a uniform
-    divergence.) ``RuntimeError`` if no steady flow was found.
+    wrong shape or not finite, if a facet is not on the boundary, or if the net flux through closed
+    walls exceeds 10⁻⁴ of the largest speed times the perimeter. (A smaller flux is interpolation
+    error, and distributed as a uniform divergence.) ``RuntimeError`` if no steady flow was found.
 
     Parameters
     ----------
@@ -110,6 +110,16 @@ class _Equations(NamedTuple):
 
 
 @skfem.BilinearForm
+def _slope_x(u, v, _w):
+    return grad(u)[0] * v
+
+
+@skfem.BilinearForm
+def _slope_y(u, v, _w):
+    return grad(u)[1] * v
+
+
+@skfem.BilinearForm
 def _convection(u, v, w):
     return (w["x"] * grad(u)[0] + w["y"] * grad(u)[1]) * v
 
@@ -130,7 +140,7 @@ def _discretise(mesh: Mesh, walls: Sequence[tuple[np.ndarray, VelocityField]],
     linear = basis_on(mesh, 1, intorder=5)
     n = basis.N
     value, on_wall, closed = _wall_values(mesh, basis, walls)
-    slopes = [_convection.assemble(basis, linear, x=x, y=y) for x, y in ((1.0, 0.0), (0.0, 1.0))]
+    slopes = [form.assemble(basis, linear) for form in (_slope_x, _slope_y)]
     divergence = sp.csr_array(sp.hstack(slopes))
     weights = integral.assemble(linear)
     load = np.zeros(2 * n)
@@ -161,19 +171,26 @@ def _wall_values(mesh: Mesh, basis: skfem.Basis,
                  walls: Sequence[tuple[np.ndarray, VelocityField]],
                  ) -> tuple[np.ndarray, np.ndarray, bool]:
     """Return the wall velocity (n, 2), its unknowns, and whether the walls are closed."""
+    if not len(walls):
+        raise ValueError("walls must hold at least one pair of facets and velocity")
     value = np.zeros((basis.N, 2))
     on_wall = np.zeros(basis.N, dtype=bool)
-    rest = basis.mesh.boundary_facets()
+    boundary = facet_set(mesh.boundary_facets)
+    rest = set(boundary)
     for i, (facets, velocity) in enumerate(walls):
-        numbers = facet_numbers(basis.mesh, facets)
-        rest = np.setdiff1d(rest, numbers)
-        middles = basis.facet_dofs[0][numbers]
+        facets = validate_facets(f"walls[{i}] must begin with facets, which", facets, mesh)
+        here = facet_set(np.sort(facets, axis=1))
+        if here - boundary:
+            raise ValueError(f"walls[{i}] must hold facets of the boundary, "
+                             f"got {min(here - boundary)}")
+        rest -= here
+        middles = basis.facet_dofs[0][facet_numbers(basis.mesh, facets)]
         dofs = np.concatenate([basis.nodal_dofs[0][facets].ravel(), middles])
         ends = mesh.points[facets]
         points = np.concatenate([ends.reshape(-1, 2), ends.mean(axis=1)])
         value[dofs] = _sample(f"walls[{i}] velocity", velocity, points)
         on_wall[dofs] = True
-    return value, np.flatnonzero(on_wall), not rest.size
+    return value, np.flatnonzero(on_wall), not rest
 
 
 def _sample(name: str, field: VelocityField, points: np.ndarray) -> np.ndarray:

@@ -2,16 +2,19 @@
 
 import copy
 import pickle
+import subprocess
+import sys
 
 import gymnasium as gym
 import numpy as np
 import pytest
-from estimation_envs import PIPE, SKEWED
+from estimation_envs import LAGGED, PIPE, SKEWED
 
 from injection_envs import FAULTS, FLOW, INFLOW, NAME
-from short import short
+from short import WANDERING, short
 
-KINDS = [(SKEWED, {}), (FAULTS, {}), (FLOW, {}), (INFLOW, {}), (NAME, {"estimator": "full", "observation": "raw"})]
+KINDS = [(LAGGED, {}), (SKEWED, {}), (NAME, {}), (NAME, {"estimator": "full", "observation": "raw"}), (FAULTS, {}),
+         (FLOW, {}), (FLOW, {"estimator": "full", "world": WANDERING}), (INFLOW, {}), (INFLOW, {"estimator": "full"})]
 COPIES = {"deepcopy": copy.deepcopy, "pickle": lambda env: pickle.loads(pickle.dumps(env))}
 
 
@@ -63,7 +66,8 @@ def test_a_copy_goes_on_as_the_original_would(name, given):
         assert other.unwrapped is not env.unwrapped and other.spec == env.spec
 
 
-@pytest.mark.parametrize(("name", "given", "how"), [(PIPE, {}, "pickle"), (NAME, {"threads": 2}, "deepcopy")])
+@pytest.mark.parametrize("how", COPIES)
+@pytest.mark.parametrize(("name", "given"), [(PIPE, {}), (NAME, {}), (INFLOW, {"threads": 2})])
 def test_vector_environments(name, given, how):
     """Copies of vector environments are equal too, with or without threads, also beyond the episode's end."""
     envs = gym.make_vec(name, num_envs=3, vectorization_mode="vector_entry_point", **short(name) | given)
@@ -75,6 +79,20 @@ def test_vector_environments(name, given, how):
     assert_equal([other.step(action) for action in actions], [envs.step(action) for action in actions])
     for each in (envs, other):
         each.close()
+
+
+def test_in_another_process(tmp_path):
+    """A pickled environment continues in another process."""
+    env, actions = begun(NAME, {})
+    (tmp_path / "env").write_bytes(pickle.dumps((env, actions)))
+    code = (f"import pathlib, pickle, sys\nimport eitbench\nhere = pathlib.Path({str(tmp_path)!r})\n"
+            "env, actions = pickle.loads((here / 'env').read_bytes())\n"
+            "(here / 'steps').write_bytes(pickle.dumps([env.step(action) for action in actions[:3]]))\n")
+    subprocess.run([sys.executable, "-c", code], check=True)
+    there = pickle.loads((tmp_path / "steps").read_bytes())
+    for a, b in zip(there, [env.step(action) for action in actions[:3]], strict=True):
+        np.testing.assert_allclose(a[1], b[1], rtol=1e-9)
+        assert a[2:] == b[2:]
 
 
 def test_a_copy_is_small():

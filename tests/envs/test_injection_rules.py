@@ -105,6 +105,25 @@ def test_dead_electrodes_measure_interference_and_carry_no_current():
     assert not read(broken[late], currents, zero).any()
 
 
+def test_a_noise_floor_adds_to_the_noise():
+    """The noise floor adds in quadrature; without a current it is the only noise."""
+    rng = np.random.default_rng(1)
+    instrument = Instrument(noise_floor=2e-3)
+    root = rng.normal(size=(16, 16))
+    R = root @ root.T
+    currents = np.zeros((3, 16))
+    currents[:2, [0, 5]] = 0.1, -0.1
+    draws = rng.normal(size=(3, 16))
+    steps = np.arange(1, 4)
+    none = instrument.draw(rng, 16, 3)
+    read = instrument.measure(none, steps, np.repeat(R[None], 3, axis=0), currents, draws)
+    clean = currents @ R
+    std = np.hypot(instrument.noise.std(clean), 2e-3)
+    np.testing.assert_allclose(read, clean + std * draws, rtol=1e-12)
+    np.testing.assert_allclose(read[2], 2e-3 * draws[2], rtol=1e-12)
+    np.testing.assert_allclose(instrument.model_noise.std(clean), std, rtol=1e-12)
+
+
 def test_faults_depend_on_the_seed_alone_and_are_shown_by_doubt():
     """Equal seeds have equal faults; high fault scores indicate electrodes with a fault after some steps."""
     faults = {"n_dead_range": [3, 3], "n_failing_range": [0, 0], "n_loose_range": [0, 0]}

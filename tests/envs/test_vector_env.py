@@ -1,6 +1,7 @@
 """Vectorised environments equal scalar environments."""
 
 import pickle
+from itertools import combinations
 
 import gymnasium as gym
 import numpy as np
@@ -8,11 +9,13 @@ import pytest
 from eitbench.envs import estimation
 from eitbench.worlds import entry
 from eitbench.worlds.task import lag_steps
-from estimation_envs import KINDS, LAGGED, PIPE, SOLID
+from estimation_envs import KINDS, LAGGED, PIPE, SMOOTHING, SOLID
 from gymnasium.envs.registration import EnvSpec
 from gymnasium.vector import AutoresetMode
 
 from short import short
+
+each_lag = pytest.mark.parametrize("name", [PIPE, LAGGED, SMOOTHING])
 
 
 def make(name=PIPE, num_envs=3, mode="vector_entry_point", **kwargs):
@@ -88,10 +91,11 @@ def test_same_as_scalar_environments(name, num_envs):
     assert num_envs == 1 or seen > world.n_steps                             # other episodes
 
 
-def test_later_resets_are_those_of_scalar_environments():
+@each_lag
+def test_later_resets_are_those_of_scalar_environments(name):
     """Resets with any sequence of seeds, partly None, during an episode or without a seed, are equal."""
-    mine = make(LAGGED)
-    sync = make(LAGGED, mode="sync")
+    mine = make(name)
+    sync = make(name, mode="sync")
     seeds = [4, 0, 9], None, [None, 7, None], 2, None, (1, 1, None), np.int64(5)
     for k, seed in enumerate(seeds):
         actions = actions_for(mine, 2 + 9 * (k % 2), seed=k)
@@ -115,9 +119,32 @@ def test_images_are_those_of_scalar_environments():
         make(render_mode="rgb_array").render()
 
 
-def test_made_again_from_its_specification():
+@each_lag
+def test_observations_are_fresh_and_within_their_space(name):
+    """Writing to an observation does not change later ones."""
+    envs = make(name)
+    actions = actions_for(envs, 30)
+    untouched = play(envs, actions, seed=1)
+    given = [*untouched[0][0].values(), *untouched[0][4].values()]
+    for step in untouched[1:]:
+        given += [*step[0].values(), *step[1:4], *step[4].values()]
+    assert not any(np.shares_memory(*pair) for pair in combinations(given, 2))
+    for step in untouched:
+        assert envs.observation_space.contains(step[0])
+        for k in range(3):
+            one = {key: array[k] for key, array in step[0].items()}
+            assert envs.single_observation_space.contains(one)
+    step = envs.reset(seed=1)
+    for action, expected in zip(actions, untouched[1:], strict=True):
+        for array in (*step[0].values(), *step[1:-1], *step[-1].values()):
+            array[...] = True
+        step = envs.step(action)
+        assert_same_play([step], [expected])
+
+
+@each_lag
+def test_made_again_from_its_specification(name):
     """An environment can be made from its EnvSpec, from JSON, from the scalar environment's spec, or by pickle."""
-    name = LAGGED
     envs = make(name)
     actions = actions_for(envs, 20)
     played = play(envs, actions, seed=1)
@@ -145,32 +172,51 @@ def test_invalid_resets_do_not_end_the_episode():
     for seed in (1.5, True, [1.7, 2, 3], [True, False, True], np.array([1.5, 2.0, 3.0]), "ab"):
         with pytest.raises(ValueError, match="seed must be"):                             # as in one environment
             envs.reset(seed=seed)
-    with pytest.raises(ValueError, match="num_envs must be"):
-        make(num_envs=0)
     with pytest.raises(ValueError, match="options must be None or empty"):
         envs.reset(options={"reset_mask": np.array([True, False, True])})
     assert_same_play([envs.step(action) for action in actions], played[1:])
 
 
-def test_wrong_actions_are_named_and_change_nothing():
+BAD = np.full((3, 1701), 30.0)
+BAD[1, 5] = np.nan
+LARGE = np.full((3, 1701), 30.0)
+LARGE[2, 7] = -250.1
+
+
+@pytest.mark.parametrize(("action", "message"), [
+    (np.zeros(1701), r"action must have shape \(3, 1701\), got \(1701,\)"),
+    (BAD, r"action must be finite in mol/m³, got 1 entries that are not, .* index \(1, 5\)"),
+    (LARGE, "action must lie within ±250 mol/m³, got 250.1"),
+    ("thirty", "action must be an array of numbers"),
+])
+def test_wrong_actions_are_named_and_change_nothing(action, message):
     """An invalid action is rejected with its value and the expectation; a valid one is accepted afterwards."""
     envs = make()
     actions = actions_for(envs, 5)
     played = play(envs, actions, seed=1)
-    large = np.full((3, 1701), 30.0)
-    large[2, 7] = -250.1
     steps = []
     envs.reset(seed=1)
     for good in actions:
-        for action, message in ((np.zeros(1701), r"action must have shape \(3, 1701\), got \(1701,\)"),
-                                (large, "action must lie within ±250 mol/m³, got 250.1")):
-            with pytest.raises(ValueError, match=message):
-                envs.step(action)
+        with pytest.raises(ValueError, match=message):
+            envs.step(action)
         steps.append(envs.step(good))
     assert_same_play(steps, played[1:])
 
 
-@pytest.mark.parametrize("change", [{"lag": 99}, {"lag": "x"}])
+def test_actions_of_any_kind_of_number_count():
+    """Single precision, lists and any memory layout are accepted as estimates."""
+    envs = make()
+    drawn = np.random.default_rng(5).uniform(20.0, 40.0, (3, 1701))
+    estimates = drawn.astype(np.float32).astype(float)
+    read_only = estimates.copy()
+    read_only.setflags(write=False)
+    plain = play(envs, [estimates] * 5, seed=1)
+    assert plain[-1][1].all()
+    for given in (estimates.astype(np.float32), estimates.tolist(), np.asfortranarray(estimates), read_only):
+        assert_same_play(play(envs, [given] * 5, seed=1), plain)
+
+
+@pytest.mark.parametrize("change", [{"num_envs": 0}, {"episodes": 0}, {"lag": 99}, {"lag": "x"}])
 def test_wrong_arguments_are_named_before_anything_is_computed(change, monkeypatch):
     """An invalid lag is rejected before meshes are built."""
     monkeypatch.setattr(estimation, "scoring_constants", None)

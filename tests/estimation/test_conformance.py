@@ -12,6 +12,7 @@ from eitbench.estimation import (
     LogStates,
     Motion,
     NodalStates,
+    VelocityInflowWindow,
     VelocityPrior,
     VelocityStates,
     fixed_interval_smoother,
@@ -38,6 +39,7 @@ from models import (
     random_model,
     shapes,
     stacked,
+    theta_of,
     two_modes,
     window_law,
 )
@@ -316,3 +318,18 @@ def test_several_blocks_of_a_dense_covariance():
             filter_.update(observation)
             np.testing.assert_array_equal(filter_.covariance.array, filter_.covariance.array.T)
             assert_state(filter_, Gaussian(now.mean, now.covariance), 1e-10)
+
+
+def test_windows_with_a_known_velocity_are_the_inflow_window():
+    """The difference is at most 1e-3 of the deviation, the truncated part of the response."""
+    task, prior = coarse_task(), two_modes(MESH.points[:7], link="linear")
+    other = Filter(InflowWindow(task, prior, LEVEL))
+    filter_ = Filter(VelocityInflowWindow(task, prior, LEVEL, known_flow(), other.space.window_steps))
+    seen, _ = measured(other, range(4))
+    for each in (filter_, other):
+        run(each, seen)
+    off = np.linalg.norm(filter_.concentration - other.concentration)
+    assert off < 0.02 * np.linalg.norm(other.concentration - LEVEL)
+    theta, variance = theta_of(filter_)
+    np.testing.assert_array_equal(theta, THETA)
+    assert not variance.any()

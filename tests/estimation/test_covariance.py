@@ -1,4 +1,4 @@
-"""Covariance forms: values and invalid arguments; linearised voltages."""
+"""Covariance forms: values and invalid arguments; consistency of the filter's reported uncertainty."""
 
 import numpy as np
 import pytest
@@ -11,13 +11,16 @@ from eitbench.estimation import (
     Motion,
     NodalStates,
     OpenLoopCovariance,
+    kalman_filter,
     linearise_voltages,
     nodal,
 )
 from eitbench.estimation.nodal import nodal_states
 from eitbench.physics.observation import VoltageNoise
+from eitbench.scoring import normalised_innovations
 from eitbench.worlds.world import Prior
-from models import QuadraticModel, coarse_transport, random_model
+from models import QuadraticModel, coarse_transport, draw, random_design, random_model
+from scipy.stats import chi2
 
 TIMES = [0, 1, 2, 3, 7, 8, 20, 60, 200]
 
@@ -56,8 +59,16 @@ def test_unstable_models_have_no_limit(radius):
         open_loop(random_model(np.random.default_rng(2), radius=radius))
 
 
+def test_stationary_target_keeps_its_covariance(model):
+    """F = I without noise, the stationary target of thesis 7.2."""
+    at_rest = OpenLoopCovariance.of(np.eye(14), np.zeros((14, 14)), model.covariance)
+    for t in (0, 1, 9):
+        np.testing.assert_allclose(at_rest.apply(t, np.eye(14)), model.covariance,
+                                   atol=1e-12 * np.abs(model.covariance).max())
+
+
 def test_open_loop_covariance_is_cached_for_a_flow_and_a_prior(tmp_path, monkeypatch):
-    """A second transport model of the same flow reads the same bits; another flow or prior has its own file."""
+    """A second process reads the same bits; another flow or prior has its own file."""
     def covariance(velocity=1.0, **prior):
         _, held = nodal_states(coarse_transport([velocity], 1e-2), Prior(**prior), 1.0).initial()
         return held.open_loop
@@ -72,8 +83,11 @@ def test_open_loop_covariance_is_cached_for_a_flow_and_a_prior(tmp_path, monkeyp
             assert np.array_equal(read.diagonal(t), built.diagonal(t))
         others = [covariance(velocity=1.1), covariance(inflow_std=0.3), covariance(initial_length=0.02)]
         assert len(list(tmp_path.rglob("open_loop*"))) == 4
-    for other in others:
-        assert not np.allclose(other.diagonal(0), built.diagonal(0)) or not np.allclose(other.limit, built.limit)
+        with monkeypatch.context() as patch:
+            patch.setattr(nodal, "MAX_STORED_OPEN_LOOPS", 2)
+            covariance(velocity=1.2)
+    assert len(list(tmp_path.rglob("open_loop*"))) == 2
+    assert all(not np.allclose(each.limit + each.diagonal(0), built.limit + built.diagonal(0)) for each in others)
 
 
 def test_arguments_are_not_modified(model):
@@ -100,6 +114,44 @@ def test_variances_are_never_negative():
 def test_errors_name_the_argument(covariance):
     with pytest.raises(ValueError, match=r"^covariance"):
         DenseCovariance(covariance)
+
+
+def twin(noise_factor):
+    """Return NIS and projected NEES, each with its degrees of freedom, of 100 episodes sampled from the model.
+
+    ``noise_factor`` multiplies the noise variances that the filter assumes. The final error is projected on
+    the last three measured directions: (Aᵀe)ᵀ (AᵀPA)⁻¹ (Aᵀe), which is χ² with three degrees of freedom.
+    """
+    rng = np.random.default_rng(2025)
+    n, m, T, episodes = 14, 3, 30, 100
+    model, design = random_model(rng, n), random_design(rng, n, T, m)
+    A = design[-1][0].T
+    space = model.filter().space
+    nis, nees = [], []
+    for _ in range(episodes):
+        truth, observations = draw(model, design, rng)
+        assumed = [o._replace(noise_variance=noise_factor * o.noise_variance) for o in observations]
+        filter_ = Filter(space)
+        steps = kalman_filter(filter_, assumed)
+        nis.append(normalised_innovations(np.array([step.innovation for step in steps]),
+                                          np.array([step.innovation_covariance for step in steps])))
+        error = A.T @ (truth[-1] - filter_.mean)
+        nees.append(error @ np.linalg.solve(A.T @ filter_.covariance.times(A), error) / m)
+    return (np.mean(nis), episodes * T * m), (np.mean(nees), episodes * m)
+
+
+def within_band(mean, freedoms):
+    """Return whether a χ²-sum over its degrees of freedom is within its central 99 %."""
+    low, high = chi2.ppf([0.005, 0.995], freedoms) / freedoms
+    return low < mean < high
+
+
+def test_filter_is_consistent_on_its_own_model():
+    """Innovations and errors match the filter's covariances, and do not if the filter assumes half the noise."""
+    assert all(within_band(*each) for each in twin(noise_factor=1.0))
+    nis, nees = twin(noise_factor=0.5)
+    assert not within_band(*nis) and not within_band(*nees)
+    assert min(nis[0], nees[0]) > 1.0
 
 
 def test_linearised_observation_is_the_tangent():

@@ -121,6 +121,16 @@ def quadratic():
 
 
 @pytest.mark.parametrize("make", [quadratic, small_tank])
+def test_constant_is_recovered_from_clean_voltages(make):
+    """V = R(30·1) yields 30 to 1e-7, from a third and from three times the value; injections may repeat."""
+    n, model = make()
+    currents = np.array([[1.0, -1.0, 0.0, 0.0], [0.0, 1.0, 0.0, -1.0], [1.0, -1.0, 0.0, 0.0], [0.0, 0.0, 1.0, -1.0]])
+    voltages = model.voltages(np.full(n, 30.0), currents)
+    for start in (10.0, 90.0):
+        assert best_homogeneous(model, VoltageNoise(), n, voltages, currents, start) == pytest.approx(30.0, rel=1e-7)
+
+
+@pytest.mark.parametrize("make", [quadratic, small_tank])
 def test_noisy_voltages_give_the_weighted_least_squares_minimum(make):
     """The result is scipy's minimum of Σ((V − R(c·1))/std)² over one number; the target is not homogeneous."""
     n, model = make()

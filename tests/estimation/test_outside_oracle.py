@@ -1,4 +1,4 @@
-"""Filters agree with cuthbert, an independent implementation in JAX (square-root forms, automatic
+"""Filters and smoothers agree with cuthbert, an independent implementation in JAX (square-root forms, automatic
 differentiation)."""
 
 import numpy as np
@@ -10,27 +10,63 @@ from eitbench.estimation import (
     LogStates,
     Motion,
     NodalStates,
+    fixed_interval_smoother,
+    kalman_filter,
 )
-from models import QuadraticModel, assert_close, random_model
+from models import QuadraticModel, draw, random_design, random_model
 
 jax = pytest.importorskip("jax")
 pytest.importorskip("cuthbert")
 jax.config.update("jax_enable_x64", True)
 
 from cuthbert import filter as run_filter  # noqa: E402
-from cuthbert.gaussian import moments  # noqa: E402
+from cuthbert import smoother as run_smoother  # noqa: E402
+from cuthbert.gaussian import kalman, moments  # noqa: E402
 from jax import numpy as jnp  # noqa: E402
 
 T = 8
 
 
-def test_extended_filter():
-    """Extended filters agree for voltages that are quadratic in the concentration, the exponential of the state."""
+def assert_gaussians(means, covariances, states):
+    """Compare means (T, n) and square roots (T, n, n) of covariances to 1e-9 of the largest entry."""
+    variances = (np.asarray(covariances)**2).sum(axis=2)
+    for theirs, ours in ((means, [state.mean for state in states]), (variances, [state.variance for state in states])):
+        np.testing.assert_allclose(ours, theirs, rtol=0, atol=1e-9 * np.abs(theirs).max())
+
+
+def dynamics(model):
+    """Return F, s and a square root of Q."""
+    root = np.linalg.cholesky(model.Q)
+    return lambda inputs: (model.F, model.s, root)
+
+
+def test_linear_gaussian_model():
+    rng = np.random.default_rng(3)
+    model = random_model(rng)
+    model = model._replace(Q=model.Q + np.eye(14))
+    _, observations = draw(model, random_design(rng, 14, T), rng)
+    H, y, variance = (np.stack(part) for part in list(zip(*observations, strict=True))[:3])
+    inputs = H, y, np.sqrt(variance)
+
+    def measurement(inputs):
+        H, y, std = inputs
+        return H, jnp.zeros(len(y)), jnp.diag(std), y
+
+    theirs = kalman.build_filter(model.mean, np.linalg.cholesky(model.covariance), dynamics(model), measurement)
+    states = run_filter(theirs, inputs, theirs.init_prepare())
+    assert_gaussians(states.mean[1:], states.chol_cov[1:], kalman_filter(model.filter(), observations))
+    smoothed = run_smoother(kalman.build_smoother(dynamics(model)), states)
+    assert_gaussians(smoothed.mean[1:], smoothed.chol_cov[1:], fixed_interval_smoother(model.filter(), observations))
+
+
+@pytest.mark.parametrize("logarithm", [False, True], ids=["concentration", "logarithm"])
+def test_extended_filter(logarithm):
+    """Extended filters agree for voltages that are quadratic in the concentration."""
     rng = np.random.default_rng(4)
     n, electrodes, std = 6, 4, 0.5
     model = random_model(rng, n)
     model = model._replace(Q=0.01 * (model.Q + np.eye(n)), covariance=0.01 * model.covariance,
-                           mean=np.zeros(n), s=0.1 * model.s)
+                           mean=np.zeros(n) if logarithm else model.mean, s=0.1 * model.s)
     seen = QuadraticModel(rng, n, electrodes)
     currents = rng.normal(size=(T, electrodes))
     y = 5.0 * rng.normal(size=(T, electrodes))
@@ -40,25 +76,25 @@ def test_extended_filter():
         computed, slope = (array[0] for array in seen.linearise(point, current[None]))
         return LinearMeasurement(slope, voltages - computed + slope @ point, np.full(electrodes, std**2))
 
-    ours, means, variances = Filter(LogStates(states, 2.0), forward), [], []
+    ours = Filter(LogStates(states, 2.0) if logarithm else states, forward)
+    steps = []
     for voltages, current in zip(y, currents, strict=True):
-        means.append(ours.assimilate(voltages, current).mean)
-        variances.append(ours.covariance.diagonal())
-    noise_root = np.linalg.cholesky(model.Q)
+        step = ours.assimilate(voltages, current)
+        steps.append(step._replace(variance=ours.covariance.diagonal()))
 
     def motion(state, inputs):
-        return (lambda x: (model.F @ x + model.s, noise_root)), state.mean
+        F, s, root = dynamics(model)(inputs)
+        return (lambda x: (F @ x + s, root)), state.mean
 
     def measurement(state, inputs):
         voltages, current = inputs
 
         def mean(x):
-            c = 2.0 * jnp.exp(x)
+            c = 2.0 * jnp.exp(x) if logarithm else x
             return jnp.einsum("j,jlm,m->l", c**2, seen.T, current), std * jnp.eye(electrodes)
 
         return mean, state.mean, voltages
 
     theirs = moments.build_filter(model.mean, np.linalg.cholesky(model.covariance), motion, measurement)
     filtered = run_filter(theirs, (y, currents), theirs.init_prepare())
-    assert_close(means, np.asarray(filtered.mean[1:]))
-    assert_close(variances, (np.asarray(filtered.chol_cov[1:])**2).sum(axis=2))
+    assert_gaussians(filtered.mean[1:], filtered.chol_cov[1:], steps)

@@ -7,8 +7,6 @@ from eitbench.envs.measured import MeasuredEnv
 from eitbench.estimation.walk import matern32_transition, matern_modes
 from tanks import FIXED_STDS, VESSEL, moving
 
-pytestmark = pytest.mark.usefixtures("coarse")
-
 
 def test_correlation_is_matern():
     """The correlation is (1 + λτ) e^−λτ; short steps compose to a long step, and the variance is stationary."""
@@ -19,6 +17,15 @@ def test_correlation_is_matern():
         assert np.linalg.eigvalsh(Q).min() > -1e-15
         short, _ = matern32_transition(phase / 8)
         np.testing.assert_allclose(np.linalg.matrix_power(short, 8), A, atol=1e-12)
+
+
+def test_process_noise_is_integrated_white_noise():
+    """Q is ∫ e^Fs L Lᵀ e^Fᵀs ds of dx = F x dt + L dw, with λ = 1 and a spectral density of 4."""
+    phase = 0.7
+    s = (np.arange(20_000) + 0.5) / 20_000 * phase
+    responses = np.array([matern32_transition(each)[0] @ [0.0, 1.0] for each in s])
+    np.testing.assert_allclose(matern32_transition(phase)[1], 4 * responses.T @ responses * phase / len(s),
+                               rtol=1e-6, atol=1e-9)
 
 
 def test_modes_reproduce_the_covariance_of_the_field():
@@ -34,7 +41,7 @@ def test_modes_reproduce_the_covariance_of_the_field():
 
 def test_smooth_motion_predicts_better_than_a_random_walk():
     """The withheld RMSE is at least a tenth smaller for an inclusion that moves half round a tank in 12 frames."""
-    env = MeasuredEnv(moving(frames=12), VESSEL, withheld=0.15, initial_std=0.2)
+    env = MeasuredEnv(moving(frames=12), VESSEL, withheld=0.15)
     random_walk, smooth_motion = (run_on_measurements(env, name).withheld_rmse
                         for name in ("log_walk_filter", "log_steady_filter"))
     assert smooth_motion < 0.9 * random_walk

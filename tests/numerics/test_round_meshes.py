@@ -53,7 +53,7 @@ each_section = pytest.mark.parametrize("section", SECTIONS.values(), ids=SECTION
 
 # -- discs ------------------------------------------------------------------------------------------------------------
 
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", range(20))
 def test_rings_are_joined_without_gap_or_overlap(seed):
     """Triangles fill the outer polygon, meet edge to edge, and have the outer ring's edges as their only boundary."""
     radii, rings = random_rings(np.random.default_rng(seed))
@@ -178,18 +178,34 @@ SQUARE = np.pi / 2 * np.arange(4)
 
 
 @pytest.mark.parametrize(("call", "match"), [
+    (lambda: disc_mesh([], []), "radii must hold at least one radius"),
+    (lambda: disc_mesh([1.0, 1.0], [SQUARE, SQUARE]), "radii must .* strictly increasing"),
+    (lambda: disc_mesh([0.0, 1.0], [SQUARE, SQUARE]), "radii must be positive"),
+    (lambda: disc_mesh([1.0, 2.0], [SQUARE]), "angles must hold one sequence for each of the 2 radii, got 1"),
+    (lambda: disc_mesh([1.0], [SQUARE[:2]]), r"angles\[0\] must hold at least three"),
+    (lambda: disc_mesh([1.0, 2.0], [SQUARE, SQUARE[::-1]]), r"angles\[1\] must .* strictly increasing"),
+    (lambda: disc_mesh([1.0], [4 / 3 * SQUARE]), r"angles\[0\] must .* within one turn"),
+    (lambda: disc_mesh([1.0], [SQUARE * np.nan]), r"angles\[0\] must be finite"),
     (lambda: disc_mesh([1.0], [SQUARE / 2]), "angles must be dense"),
     (lambda: disc_mesh([1.0, 1.1], [2 * np.pi * np.arange(12) / 12, SQUARE]), "angles must be dense"),
+    (lambda: uniform_disc(0.0, 3), "radius must be a finite number"),
+    (lambda: uniform_disc(1.0, 0), "rings must be an integer"),
+    (lambda: electrode_disc(-1.0, SPANS, 3, 3), "radius must be a finite number"),
+    (lambda: electrode_disc(R, SPANS, 0, 3), "cells_at_electrodes must be an integer"),
+    (lambda: electrode_disc(R, SPANS, 3, 0), "rings must be an integer"),
     (lambda: electrode_disc(R, SPANS[::-1], 3, 3), "spans must .* increase"),
     (lambda: electrode_disc(R, SPANS[:0], 3, 3), "spans must hold at least one electrode"),
     (lambda: electrode_disc(R, np.array([[0.0, 1.0], [1.0, 2.0]]), 3, 3), "spans must .* keep a gap"),
     (lambda: electrode_disc(R, np.array([[0.0, 1.0], [5.0, 6.5]]), 3, 3), "spans must .* within one turn"),
+    (lambda: electrode_disc(R, SPANS, 3, 3, (0.5, 1.0)), "grading must be a finite number"),
     (lambda: electrode_disc(R, SPANS[:1], 8, 8), "angles must be dense"),
     (lambda: extrude(extrude(SECTIONS["uniform"], Z), Z), "section must be a mesh of triangles, got one in 3D"),
     (lambda: extrude(SECTIONS["uniform"], [0.0]), "z must hold at least two strictly increasing"),
     (lambda: extrude(SECTIONS["uniform"], [0.0, 1.0, 1.0]), "z must hold at least two strictly increasing"),
+    (lambda: round_pipe_mesh(np.nan, R, SPANS, np.array([[0.03, 0.07]]), (2, 2), 3), "length must be a finite number"),
     (lambda: round_pipe_mesh(0.05, R, SPANS, np.array([[0.03, 0.07]]), (2, 2), 3), "spans_along must .* inside the"),
-    (lambda: round_pipe_mesh(0.4, R, SPANS, np.zeros((0, 2)), (2, 2), 3), "spans_along must")])
+    (lambda: round_pipe_mesh(0.4, R, SPANS, np.zeros((0, 2)), (2, 2), 3), "spans_along must"),
+    (lambda: round_pipe_mesh(0.4, R, SPANS, np.array([[0.03, 0.07]]), (2, 0), 3), "cells_at_electrodes.*an integer")])
 def test_wrong_arguments_are_refused(call, match):
     """Invalid arguments are named before a mesh is built."""
     with pytest.raises(ValueError, match=re.compile(match, re.DOTALL)):

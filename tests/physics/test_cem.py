@@ -11,6 +11,7 @@ from eitbench.physics.cem import CompleteElectrodeModel
 from eitbench.worlds.catalogue import PIPE_2D
 from numpy.testing import assert_allclose
 
+from references import reference_model, unsymmetrised
 from shapes import (
     annulus_resistance,
     dense_solution,
@@ -67,18 +68,45 @@ every_element = pytest.mark.parametrize(("dim", "order"), [(2, 1), (2, 2), (3, 1
 
 @every_element
 def test_dense_reference(dim, order):
-    """The fast path (fixed pattern, precomputed derivatives, grounded last electrode) solves the stated equations, also
-    with other contacts than it was built for."""
+    """The fast path (fixed pattern, precomputed derivatives, grounded last electrode) solves the stated equations."""
+    mesh, electrodes, sigma = small(dim)
+    currents = patterns(4)
+    dense = dense_solution(mesh, electrodes, IMPEDANCE, order, sigma, currents)
+    voltages = small_cem(dim, order).voltages(sigma, currents)
+    assert_allclose(voltages, dense.voltages, atol=1e-10 * np.abs(voltages).max())
+
+
+@every_element
+def test_other_contacts_are_solved_with(dim, order):
+    """Voltages equal the dense solution with these impedances; the original model is unchanged."""
     mesh, electrodes, sigma = small(dim)
     currents = patterns(4)
     cem = small_cem(dim, order)
-    others = cem.with_contacts(IMPEDANCE * np.array([0.5, 1.5, 1.2, 0.8]))
-    for model in (others, cem):
-        dense = dense_solution(mesh, electrodes, model.contact_impedance, order, sigma, currents)
-        voltages = model.voltages(sigma, currents)
-        assert_allclose(voltages, dense.voltages, atol=1e-10 * np.abs(voltages).max())
+    before = cem.voltages(sigma, currents)
+    others = IMPEDANCE * np.array([0.5, 1.5, 1.2, 0.8])
+    other = cem.with_contacts(others)
+    dense = dense_solution(mesh, electrodes, others, order, sigma, currents)
+    assert_allclose(other.voltages(sigma, currents), dense.voltages, atol=1e-10 * np.abs(before).max())
+    assert_allclose(other.contact_impedance, others)
+    assert_allclose(cem.voltages(sigma, currents), before, rtol=1e-12)
     with pytest.raises(ValueError, match="contact_impedance"):
-        cem.with_contacts(-IMPEDANCE)
+        cem.with_contacts(-others)
+
+
+@every_element
+def test_scipy_agrees(dim, order):
+    """scipy's factorisation gives the kernels' 𝓡, of one state or a batch, and its derivatives."""
+    mesh, electrodes, _ = small(dim)
+    compiled = small_cem(dim, order)
+    scipy = reference_model(mesh, electrodes, IMPEDANCE, order)
+    states = np.random.default_rng(3).uniform(0.5, 2.0, (2, 5, mesh.n_nodes))
+    expected = scipy.transfer_resistance(states)
+    tiny = 1e-11 * np.abs(expected).max()
+    assert_allclose(compiled.transfer_resistance(states), expected, rtol=0, atol=tiny)
+    resistance, table = compiled.transfer_resistance_derivatives(states[1, 2])
+    assert_allclose(resistance, expected[1, 2], rtol=0, atol=tiny)
+    _, slopes = scipy.transfer_resistance_derivatives(states[1, 2])
+    assert_allclose(table, slopes, rtol=1e-7, atol=1e-11 * np.abs(table).max())
 
 
 @every_element
@@ -112,26 +140,26 @@ def test_full_end_electrodes(dim, order):
 def test_uneven_slab():
     """For σ linear along a slab, R → ln(σ₁/σ₀)/(σ₁ − σ₀) + 2z, at order 4 with P2."""
     errors = []
-    for cells in (8, 16):
+    for cells in (4, 8, 16):
         mesh = shaken_rectangle(1.0, 1.0, (cells, 2), np.random.default_rng(0))
         cem = CompleteElectrodeModel(mesh, end_facets(mesh), 0.1)
         R = cem.transfer_resistance(0.5 + 3.0 * mesh.points[:, 0])
         errors.append((R[0, 0] - R[0, 1]) * 2 / (np.log(3.5 / 0.5) / 3.0 + 0.2) - 1)
-    assert 3.5 < np.log2(abs(errors[0] / errors[1])) < 4.5
-    assert abs(errors[1]) < 1e-5
+    assert 3.5 < np.log2(abs(errors[1] / errors[2])) < 4.5
+    assert abs(errors[2]) < 1e-5
 
 
-@pytest.mark.parametrize(("order", "final"), [(1, 8e-4), (2, 1.6e-4)])
+@pytest.mark.parametrize(("order", "final"), [(1, 2e-4), (2, 4e-5)])
 def test_annulus(order, final):
     """For a radial current in an annulus, R approaches the closed form like h² (circles are polygons here)."""
     a, b, sigma, z = 0.03, 0.1, 0.4, (2e-2, 5e-2)
     errors = []
-    for n in (16, 32):
+    for n in (32, 64):
         mesh = polar_mesh(np.geomspace(a, b, n + 1), 2 * np.pi * np.arange(2 * n) / (2 * n))
         cem = CompleteElectrodeModel(mesh, [ring_facets(mesh, a), ring_facets(mesh, b)], np.array(z), order)
         (inner, outer), = cem.voltages(np.full(mesh.n_nodes, sigma), np.array([[1.0, -1.0]]))
         errors.append((inner - outer) / annulus_resistance(a, b, sigma, z) - 1)
-    assert 1.85 < np.log2(errors[0] / errors[1]) < 2.1
+    assert 1.9 < np.log2(errors[0] / errors[1]) < 2.1
     assert abs(errors[1]) < final
 
 
@@ -156,9 +184,10 @@ def disc_reference(homogeneous: bool) -> np.ndarray:
 
 def test_disc_reference_is_converged():
     """The semi-analytic 𝓡 has converged to 1e-6 in polynomial degree and number of Fourier modes."""
-    rough = disc_resistance(RADIUS, SPANS, CONTACTS, disc_modes(inclusion, RADIUS, 20), SALINE, 16, 5_000)
+    rough = disc_resistance(RADIUS, SPANS, CONTACTS, disc_modes(inclusion, RADIUS, 20), SALINE, 16, 10_000)
     reference = disc_reference(homogeneous=False)
-    assert np.linalg.norm(rough - reference) < 1e-5 * np.linalg.norm(reference)
+    assert np.linalg.norm(rough - reference) < 3e-6 * np.linalg.norm(reference)
+    assert np.linalg.norm(disc_reference(homogeneous=True) - reference) > 0.05 * np.linalg.norm(reference)
 
 
 def test_disc():
@@ -166,7 +195,7 @@ def test_disc():
     errors, results = [], []
     references = np.stack([disc_reference(True), disc_reference(False)])
     size = np.linalg.norm(references, axis=(1, 2))
-    for n in (6, 12, 24):
+    for n in (8, 16, 32):
         mesh, electrodes = disc_mesh(RADIUS, SPANS, n, grading=2.5)
         cem = CompleteElectrodeModel(mesh, electrodes, CONTACTS)
         r = np.hypot(*mesh.points.T)
@@ -174,20 +203,26 @@ def test_disc():
         errors.append(np.linalg.norm(results[-1] - references, axis=(1, 2)) / size)
     rate = np.log2(errors[1] / errors[2])
     assert (rate > 1.8).all() and (rate < 2.2).all(), errors
-    assert (errors[2] < 3e-4).all(), errors
+    assert (errors[2] < 1.5e-4).all(), errors
     # Taking out the h² term leaves a limit that is the disc's, not merely one close by.
     limit = (4 * results[2] - results[1]) / 3
-    assert (np.linalg.norm(limit - references, axis=(1, 2)) < 4e-5 * size).all()
+    assert (np.linalg.norm(limit - references, axis=(1, 2)) < 2e-5 * size).all()
 
 
 # -- algebra of the transfer resistance -------------------------------------------------------------------------------
 
 @every_element
 def test_reciprocity(dim, order):
-    """Reciprocity I₁·U(I₂) = I₂·U(I₁) holds."""
-    cem, sigma, currents = small_cem(dim, order), small(dim)[2], patterns(4)
-    mutual = currents @ cem.voltages(sigma, currents).T
-    assert_allclose(mutual, mutual.T, atol=1e-12 * np.abs(mutual).max())
+    """Reciprocity I₁·U(I₂) = I₂·U(I₁) holds, also in scipy's grounded solution, which is not symmetrised."""
+    mesh, electrodes, sigma = small(dim)
+    cem = reference_model(mesh, electrodes, IMPEDANCE, order)
+    currents = patterns(4)
+    for model in (cem, small_cem(dim, order)):
+        mutual = currents @ model.voltages(sigma, currents).T
+        assert_allclose(mutual, mutual.T, atol=1e-12 * np.abs(mutual).max())
+    raw = unsymmetrised(cem, sigma)
+    assert raw.shape == (3, 3)
+    assert_allclose(raw, raw.T, rtol=1e-10)
 
 
 def test_batch():
@@ -232,8 +267,9 @@ def test_pipe_meshes_are_fine_enough():
     """The P2 mesh error is below 0.25 noise std for estimators and 0.05 for the truth; the P1 error is too large."""
     pipe = PIPE_2D.vessel
     currents = PIPE_2D.currents
-    mesh = graded_pipe_mesh(pipe.length, pipe.half_width, pipe.electrode_spans, 18, 36)
+    mesh = graded_pipe_mesh(pipe.length, pipe.half_width, pipe.electrode_spans, 24, 44)
     fine = CompleteElectrodeModel(mesh, pipe.electrodes(mesh), pipe.contact_impedance)
+    assert fine.n_unknowns > 60_000
     exact = fine.voltages(slugs(mesh.points), currents)
     model = pipe.electrode_model(fine=False)
     truth = pipe.electrode_model(fine=True)

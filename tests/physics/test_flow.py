@@ -44,6 +44,12 @@ def test_flow_has_no_divergence(flow):
     assert np.ptp(velocity[:, 0]) > 1.0
 
 
+def test_fluid_rests_at_the_walls_and_is_fastest_on_the_axis():
+    """No slip at y = ±R, 1.5·v̄ on the axis, nothing across the channel."""
+    velocity = PlaneChannelFlow(2.0, 0.3)(np.array([[0.0, -0.3], [1.0, 0.0], [2.0, 0.3]]))
+    np.testing.assert_allclose(velocity, [[0.0, 0.0], [3.0, 0.0], [0.0, 0.0]], atol=1e-15)
+
+
 @pytest.mark.parametrize("exponent", [1 / 7, 1 / 3, 1.0, 2.0])
 def test_power_law_has_the_requested_mean(exponent):
     """(1/R) ∫₀ᴿ v dy = v̄ on both sides, with the variable t = (1 − y/R)^(1/7), in which v is smooth."""
@@ -59,6 +65,13 @@ def test_power_law_is_flatter_than_laminar_flow():
     y = R * np.array([0.0, 127 / 128, -127 / 128, 1.0, -1.0 - 1e-15])
     velocity = PowerLawFlow(7.0, R)(np.column_stack([np.zeros(5), y]))
     np.testing.assert_allclose(velocity[:, 0], [8.0, 4.0, 4.0, 0.0, 0.0], atol=1e-12)
+
+
+def test_plug_flow_is_the_same_everywhere():
+    """The velocity is v̄ along x at any point, also on the wall, in 2D and in 3D."""
+    plug = PowerLawFlow(3.0, 0.05, 0.0)
+    np.testing.assert_array_equal(plug(np.array([[0.1, -0.05], [2.0, 0.0]])), [[3.0, 0.0], [3.0, 0.0]])
+    np.testing.assert_array_equal(plug(np.zeros((1, 3))), [[3.0, 0.0, 0.0]])
 
 
 def test_round_pipe_carries_its_mean_velocity():
@@ -80,6 +93,17 @@ def test_round_pipe_carries_its_mean_velocity():
     assert lost[0] / lost[1] == pytest.approx(4.0, rel=0.1)
 
 
+def test_round_pipe_rests_at_the_wall_and_is_fastest_on_the_axis():
+    """2·v̄ on the axis, no slip on the wall, never upstream, nothing across; z does not matter."""
+    angle = np.linspace(0.0, 6.0, 50)
+    wall = 0.3 * np.column_stack([np.cos(angle), np.sin(angle), angle])
+    flow = RoundPipeFlow(2.0, 0.3)
+    assert flow(wall)[:, 2].min() >= 0.0
+    np.testing.assert_allclose(flow(wall), 0.0, atol=1e-14)
+    np.testing.assert_array_equal(flow(1.1 * wall), 0.0)
+    np.testing.assert_array_equal(flow(np.array([[0.0, 0.0, -1.0], [0.0, 0.0, 5.0]])), [[0.0, 0.0, 4.0]] * 2)
+
+
 @pytest.mark.parametrize("k", [-1.0, 0.8, 5.0])
 def test_skewed_profile_is_the_formula(k):
     """v = v̄ (1 − η²)·exp(kη) over its mean in closed form: at rest on the walls, fastest at η = (√(1 + k²) − 1)/k;
@@ -92,10 +116,15 @@ def test_skewed_profile_is_the_formula(k):
     np.testing.assert_allclose(SkewedChannelFlow(2.0, R, -k).profile(-R * eta), profile, rtol=1e-13)
 
 
+def test_without_skewness_it_is_the_plane_channel_flow():
+    """k = 0 is the parabola, at every point."""
+    np.testing.assert_allclose(SkewedChannelFlow(4.5, R)(POINTS), PlaneChannelFlow(4.5, R)(POINTS), rtol=1e-13)
+
+
 @pytest.mark.parametrize(("flow", "point", "velocity"), [
     (PlaneChannelFlow(1.0, 2.0), [0, 1], [1.125, 0.0]), (SkewedChannelFlow(1.0, 2.0), [0, 1], [1.125, 0.0]),
     (parabolic_model(2.0, 1.0, 1.0, 0.0).field([1.0]), [0, 1], [1.125, 0.0]),
-    (PowerLawFlow(1.0, 2.0, 0.5), [0, 1], [1.5 * np.sqrt(0.5), 0.0]), (PowerLawFlow(0.5, 2.0, 0.0), [0, 2], [0.5, 0.0]),
+    (PowerLawFlow(1.0, 2.0, 0.5), [0, 1], [1.5 * np.sqrt(0.5), 0.0]), (PowerLawFlow(0.5, 2.0, 0.0), [0, 1], [0.5, 0.0]),
     (RoundPipeFlow(1.0, 2.0), [0, 1, 0], [0.0, 0.0, 1.5])], ids=lambda value: type(value).__name__)
 def test_integer_points_are_taken_as_numbers(flow, point, velocity):
     """No field inherits an integer type from its points: 1.5·(1 − ¼) is not rounded to 1."""
@@ -114,11 +143,29 @@ def test_quadrature_is_exact():
     assert MODEL.gram[:2, :2] == pytest.approx(R * np.diag([1.5**2 * 16 / 15, 8 / 3]), abs=1e-15)
 
 
+def test_profiles_are_those_of_the_directions():
+    """φ_k at `points` is the axial velocity of the k-th basis field, here computed by hand."""
+    eta = MODEL.points / R
+    by_hand = np.stack([1.5 - 1.5 * eta**2, 2.0 * eta, 0.5 + 0.25 * eta - 0.75 * eta**3], axis=1)
+    np.testing.assert_allclose(MODEL.profiles, by_hand, rtol=1e-12, atol=1e-15)
+    at = np.column_stack([np.full(24, 0.2), MODEL.points])
+    for profile, direction in zip(MODEL.profiles.T, MODEL.basis_fields, strict=True):
+        np.testing.assert_allclose(direction(at), np.column_stack([profile, np.zeros(24)]), rtol=1e-12, atol=1e-15)
+    assert len(MODEL.basis_fields) == MODEL.n_parameters == MODEL.profiles.shape[1] == 3
+
+
 def test_field_is_the_sum_of_its_directions():
     """v = Σ θ_k φ_k anywhere in the channel, for any degrees of the φ_k."""
     theta = np.array([4.0, -1.5, 0.7])
     total = sum(value * direction(POINTS) for value, direction in zip(theta, MODEL.basis_fields, strict=True))
     np.testing.assert_allclose(MODEL.field(theta)(POINTS), total, rtol=1e-12, atol=1e-14)
+
+
+def test_parabola_is_the_plane_channel_flow_of_its_mean():
+    """The only parameter is the mean velocity."""
+    model = parabolic_model(R, 4.5, 1.0, 0.02)
+    np.testing.assert_allclose(model.field([3.7])(POINTS), PlaneChannelFlow(3.7, R)(POINTS), rtol=1e-12)
+    assert (model.nominal, model.initial_std, model.walk_std) == ((4.5,), (1.0,), (0.02,))
 
 
 @pytest.mark.parametrize("k", [-1.0, 0.6, 1.0])
@@ -155,9 +202,13 @@ def test_skewed_basis_rests_on_the_walls_and_only_the_first_carries_fluid():
 
 
 @pytest.mark.parametrize(("field", "arguments", "name"), [
-    (PlaneChannelFlow, (-1.0, 0.05), "mean_velocity"), (PlaneChannelFlow, (4.5, np.inf), "half_width"),
-    (PowerLawFlow, (4.5, 0.05, -0.1), "exponent"), (PowerLawFlow, (-1.0, 0.05), "mean_velocity"),
-    (RoundPipeFlow, (4.5, 0.0), "radius"), (SkewedChannelFlow, (4.5, R, 5.1), "skewness")])
+    (PlaneChannelFlow, (-1.0, 0.05), "mean_velocity"), (PlaneChannelFlow, (np.nan, 0.05), "mean_velocity"),
+    (PlaneChannelFlow, ("fast", 0.05), "mean_velocity"), (PlaneChannelFlow, (4.5, 0.0), "half_width"),
+    (PlaneChannelFlow, (4.5, np.inf), "half_width"), (PowerLawFlow, (-1.0, 0.05), "mean_velocity"),
+    (PowerLawFlow, (4.5, 0.0), "half_width"), (PowerLawFlow, (4.5, 0.05, -0.1), "exponent"),
+    (RoundPipeFlow, (-1.0, 0.05), "mean_velocity"),
+    (RoundPipeFlow, (4.5, 0.0), "radius"), (SkewedChannelFlow, (4.5, 0.0), "half_width"),
+    (SkewedChannelFlow, (4.5, R, 5.1), "skewness"), (SkewedChannelFlow, (4.5, R, np.nan), "skewness")])
 def test_errors_name_the_argument(field, arguments, name):
     """A negative, infinite or missing number is rejected by name."""
     with pytest.raises(ValueError, match=name):
@@ -166,7 +217,8 @@ def test_errors_name_the_argument(field, arguments, name):
 
 @pytest.mark.parametrize(("change", "message"), [
     ({"half_width": 0.0}, "half_width"), ({"nominal": (4.5, 0.0)}, r"nominal must have shape \(1,\), got \(2,\)"),
-    ({"walk_std": (np.inf,)}, "walk_std must be finite"), ({"initial_std": (-1.0,)}, "initial_std must be"),
+    ({"initial_std": ()}, "initial_std must have shape"), ({"walk_std": (np.inf,)}, "walk_std must be finite"),
+    ({"nominal": ("fast",)}, "nominal must be an array"), ({"initial_std": (-1.0,)}, "initial_std must be"),
 ])
 def test_errors_of_the_model_name_the_argument(change, message):
     """A model needs one number in m/s for each profile, and nonnegative standard deviations."""
@@ -174,5 +226,13 @@ def test_errors_of_the_model_name_the_argument(change, message):
               "walk_std": (0.02,)}
     with pytest.raises(ValueError, match=message):
         VelocityModel(**fields | change)
-    with pytest.raises(ValueError, match=r"parameters must have shape \(3,\), got \(2,\)"):
-        MODEL.field([1.0, 2.0])
+
+
+@pytest.mark.parametrize(("parameters", "message"), [
+    ([1.0, 2.0], r"parameters must have shape \(3,\), got \(2,\)"), (4.5, "parameters must have shape"),
+    ([1.0, np.nan, 0.0], "parameters must be finite"),
+])
+def test_wrong_parameters_are_named(parameters, message):
+    """Parameters are one finite number for each profile."""
+    with pytest.raises(ValueError, match=message):
+        MODEL.field(parameters)

@@ -7,7 +7,7 @@ import pytest
 from eitbench.numerics.mesh import rectangle_mesh
 from eitbench.physics.cem import CompleteElectrodeModel
 from eitbench.physics.observation import LinearConductivity, ObservationModel, VoltageNoise
-from numpy.testing import assert_allclose
+from numpy.testing import assert_allclose, assert_array_equal
 
 from shapes import RootLaw
 
@@ -127,3 +127,12 @@ def test_wrong_concentrations_are_refused():
                 call(bad)
     with pytest.raises(ValueError, match="min_concentration must be"):
         ObservationModel(model.cem, model.interpolation, LAWS[0], 0.0)
+
+
+def test_arguments_are_left_alone():
+    """Concentration and currents are unchanged."""
+    model = observation(LAWS[1])
+    c, currents = np.full(model.interpolation.shape[1], -1.0), PATTERNS.copy()
+    model.linearise(c, currents)
+    assert_array_equal(c, -1.0)
+    assert_array_equal(currents, PATTERNS)

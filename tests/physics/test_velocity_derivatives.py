@@ -143,6 +143,17 @@ def test_derivatives_at_the_inlet_are_zero():
     np.testing.assert_array_equal(cd.velocity_derivatives(c, before, after, [PARABOLA])[1], derivatives)
 
 
+def test_transition_is_that_of_the_evolution_model():
+    """F and Y are the same with and without H, in either order."""
+    first, second = build(eddy), build(eddy)
+    F, Y = first.transition()
+    for model in (first.evolution_model(), second.evolution_model()):
+        np.testing.assert_array_equal(model.F, F)
+        np.testing.assert_array_equal(model.Y, Y)
+    np.testing.assert_array_equal(second.transition()[0], F)
+    assert first.evolution_model().F is F
+
+
 @pytest.mark.parametrize(("c", "before", "after", "directions", "name"), [
     (np.zeros(90), 0.0, 0.0, [PARABOLA], "^c "), (np.zeros((91, 2)), 0.0, 0.0, [PARABOLA], "^c "),
     (np.full(91, np.nan), 0.0, 0.0, [PARABOLA], "^c "), (np.zeros(91), np.zeros(6), 0.0, [PARABOLA], "inflow_before"),

@@ -1,4 +1,4 @@
-"""Results of the compiled kernels by scipy and numpy alone: references for benchmarks.
+"""Results of the compiled kernels by scipy and numpy alone: references for tests and benchmarks.
 
 Only the models around the kernels are code under test.
 """
@@ -11,9 +11,8 @@ from unittest import mock
 import numpy as np
 import scipy.sparse as sp
 import skfem
-from scipy.sparse.linalg import SuperLU, splu
-
 from eitbench.physics import cem, transport
+from scipy.sparse.linalg import SuperLU, splu
 
 SYMMETRIC = {"diag_pivot_thresh": 0.0, "options": {"SymmetricMode": True}}
 
@@ -26,16 +25,14 @@ class SuperLUCondensation:
 
     batch = 1
 
-    def __init__(self, pattern: sp.csc_array, n_ports: int,
-                 places: np.ndarray | None = None) -> None:
+    def __init__(self, pattern: sp.csc_array, n_ports: int, places: np.ndarray | None = None) -> None:
         del places                                       # the order affects only the speed
         self.n = pattern.shape[0]
         self.n_ports = n_ports
         inner = pattern[:-n_ports, :-n_ports]
         self._place = np.append(_minimum_degree(inner), np.arange(self.n - n_ports, self.n))
         coo = pattern.tocoo()
-        entries = (np.ones(coo.nnz), (self._place[coo.row], self._place[coo.col]))
-        permuted = sp.csc_array(entries, shape=pattern.shape)
+        permuted = sp.csc_array((np.ones(coo.nnz), (self._place[coo.row], self._place[coo.col])), shape=pattern.shape)
         permuted.sort_indices()
         self._indices = permuted.indices
         self._indptr = permuted.indptr
@@ -141,6 +138,11 @@ def reference_model(*arguments, **options) -> cem.CompleteElectrodeModel:
     assert isinstance(model._system, SuperLUCondensation)
     assert isinstance(model._sensitivity, NumpySensitivity)
     return model
+
+
+def unsymmetrised(model: cem.CompleteElectrodeModel, conductivity: np.ndarray) -> np.ndarray:
+    """Return 𝓡 with the last electrode grounded, (L − 1, L − 1), from the factorisation."""
+    return model._system.port_inverse(model._assemble(conductivity))
 
 
 def reference_flow(*arguments, **options) -> transport.ConvectionDiffusion:
