@@ -27,6 +27,8 @@ from numpy.typing import ArrayLike
 from scipy.stats import norm
 from scipy.stats import t as student
 
+from eitbench import _check
+
 Scores = Mapping[str, Mapping[str, float]]
 """Environment -> seed -> score of one method."""
 Statistic = Callable[..., Any]
@@ -54,6 +56,8 @@ def interquartile_mean(*scores: ArrayLike) -> Any:
     -------
     (...) array; a number for arrays (n_e,).
     """
+    if not sum(np.shape(each)[-1] for each in scores):
+        raise ValueError("scores must hold at least one score")
     # equals scipy.stats.trim_mean(…, 0.25), but does not depend on the order to the last bit
     ordered = np.sort(np.concatenate([np.asarray(each, float) for each in scores], axis=-1))
     cut = ordered.shape[-1] // 4
@@ -62,6 +66,8 @@ def interquartile_mean(*scores: ArrayLike) -> Any:
 
 def mean_over_environments(*scores: ArrayLike) -> Any:
     """Average the means of the environments, (...) from (..., n_e) each, with equal weights."""
+    if not scores or not all(np.shape(each)[-1] for each in scores):
+        raise ValueError("scores must hold at least one score of each environment")
     return np.mean([np.mean(np.asarray(each, float), axis=-1) for each in scores], axis=0)
 
 
@@ -170,9 +176,14 @@ def mean_by_seed(scores: Sequence[Mapping[str, float]]) -> dict[str, float]:
 
 def _resample(strata: Sequence[np.ndarray], statistic: Statistic, n_resamples: int) -> np.ndarray:
     """Compute a statistic (n_resamples,) of resamples of the strata (n_e,)."""
+    _check.integer("n_resamples", n_resamples, low=1)
     positions = _positions(tuple(map(len, strata)), n_resamples)
-    return np.asarray(statistic(*(stratum[drawn] for stratum, drawn
-                                  in zip(strata, positions, strict=True))))
+    values = np.asarray(statistic(*(stratum[drawn] for stratum, drawn
+                                    in zip(strata, positions, strict=True))))
+    if values.shape != (n_resamples,):  # e.g. np.mean would also average over the resamples
+        raise ValueError("statistic must reduce the last axis only: expected shape "
+                         f"{(n_resamples,)}, got {values.shape}")
+    return values
 
 
 @lru_cache(maxsize=4)

@@ -138,6 +138,8 @@ def read_case(name: Path | str) -> MeasuredCase:
                  for error in schema.iter_errors(entries)]
     except ValueError as error:                         # a date, or a name that is not a text
         wrong = [f"case: {error}"]
+    if not wrong and (span := entries.get("span", [0, 1]))[0] >= span[1]:
+        wrong = [f"case.span: must be two increasing numbers, got {span}"]
     if wrong:
         raise ValueError(f"{path}: {'; '.join(wrong)}")
     fixed = {each.name: entries.pop(each.name) for each in fields(MeasuredCase)

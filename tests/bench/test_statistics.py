@@ -262,6 +262,11 @@ def test_ranks_agree_with_the_definition(statistic, higher):
 
 
 @pytest.mark.parametrize(("call", "message"), [
+    (lambda: interquartile_mean(), "scores must hold"),
+    (lambda: interquartile_mean([]), "scores must hold"),
+    (lambda: mean_over_environments([1.0], []), "scores must hold"),
+    (lambda: stratified_bootstrap({"pipe": NOISE}, np.mean), "statistic must reduce the last axis only"),
+    (lambda: stratified_bootstrap({"pipe": NOISE}, interquartile_mean, n_resamples=0), "n_resamples must be"),
     (lambda: stratified_bootstrap({}, interquartile_mean), "scores must be finite"),
     (lambda: stratified_bootstrap({"pipe": []}, interquartile_mean), "scores must be finite"),
     (lambda: stratified_bootstrap({"pipe": np.ones((3, 3))}, interquartile_mean), "scores must be finite"),

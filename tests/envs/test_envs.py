@@ -37,7 +37,7 @@ def test_every_id_has_a_short_version():
 @pytest.mark.filterwarnings("ignore:We recommend you to use a symmetric and normalized Box action space")
 def test_checkers_pass(id):
     """Spaces, seeding, returned types and rendering meet the requirements of gymnasium and stable-baselines3."""
-    check_env(make(id, render_mode="rgb_array").unwrapped, skip_render_check=id != STIRRED)
+    check_env(make(id, render_mode="rgb_array").unwrapped, skip_render_check=id not in KINDS)
     check_env_sb3(make(id).unwrapped)
 
 
@@ -56,7 +56,7 @@ def test_contract(id, estimator, observation):
     env = injection_envs.make(estimator, id, observation) if estimator else make(id)
     actions = some_actions(env) if estimator else noise_actions(env)
     steps = play(env, 1, actions)
-    assert len(steps) - 1 == env.unwrapped.episode_steps
+    assert len(steps) - 1 == env.unwrapped.episode_steps == env.spec.max_episode_steps
     arrays = [array for step in steps for array in arrays_of(step[0])]
     assert len({array.__array_interface__["data"][0] for array in arrays}) == len(arrays)
     for shown, reward, terminated, truncated, info in steps:
@@ -66,13 +66,25 @@ def test_contract(id, estimator, observation):
         assert all(np.isscalar(value) for value in info.values())
     with pytest.raises(gym.error.ResetNeeded):
         env.unwrapped.step(actions[0])
-    again = gym.make(EnvSpec.from_json(env.spec.to_json()))
+    again = gym.make(EnvSpec.from_json(env.spec.to_json()), max_episode_steps=-1)
     assert again.unwrapped.world == env.unwrapped.world and again.unwrapped.task.lag == env.unwrapped.task.lag
     for other in (pickle.loads(pickle.dumps(env)), again):
         for a, b in zip(steps, play(other, 1, actions), strict=True):
             pairs = zip(arrays_of(a[0]), arrays_of(b[0]), strict=True)
             assert all((x == y).all() for x, y in pairs)
             assert a[1:] == b[1:]
+
+
+def test_gymnasiums_wrapper_of_the_spec_changes_one_flag():
+    """Gymnasium's wrapper around an environment from a spec with a number of steps truncates the last step too."""
+    env = make(PIPE)
+    again = gym.make(env.spec)
+    assert [step[2:4] for step in play(again, 0, noise_actions(env))][-2:] == [(False, False), (True, True)]
+    assert gym.spec(PIPE).max_episode_steps is None
+    steps = env.spec.max_episode_steps
+    assert gym.make_vec(env.spec, num_envs=2).cores[0].length == steps
+    with pytest.raises(ValueError, match=f"must be None or the steps of an episode, {steps}, got 1"):
+        gym.make_vec(PIPE, num_envs=2, max_episode_steps=1, **short(PIPE))
 
 
 @pytest.mark.parametrize("id", ESTIMATION)
@@ -86,9 +98,9 @@ def test_world_is_that_of_the_id_but_for_the_changes(id):
     assert make(id, lag=1).unwrapped.lag == make(id, lag=1).unwrapped.task.lag == 1
 
 
-def test_same_observation_in_another_process(tmp_path):
+@pytest.mark.parametrize("id", ["eitbench/Pipe2DTimeVaryingVelocity-v0", STIRRED])
+def test_same_observation_in_another_process(id, tmp_path):
     """An episode depends on the seed only: another process with an empty cache simulates the same bits."""
-    id = "eitbench/Pipe2DTimeVaryingVelocity-v0"
     code = ("import gymnasium as gym, eitbench\n"
             f"observation, _ = gym.make({id!r}, **{short(id)!r}).reset(seed=1)\n"
             "print(observation['voltages'].tobytes().hex())")
@@ -97,7 +109,8 @@ def test_same_observation_in_another_process(tmp_path):
     assert make(id).reset(seed=1)[0]["voltages"].tobytes().hex() == other.stdout.strip()
 
 
-@pytest.mark.parametrize(("id", "kwargs", "dev"), [(STIRRED, {}, 0), (NAME, {"split": "dev"}, 100_000)])
+@pytest.mark.parametrize(("id", "kwargs", "dev"), [
+    (PIPE, {}, 0), (STIRRED, {}, 0), (PIPE, {"split": "dev"}, 100_000), (NAME, {"split": "dev"}, 100_000)])
 def test_resets_without_a_seed_follow_the_first_seed(id, kwargs, dev):
     """After a seeded reset, others draw all training or dev episodes from np_random, in vector environments too."""
     one, other = (make(id, **kwargs) for _ in range(2))

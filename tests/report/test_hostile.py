@@ -17,9 +17,9 @@ from typer.testing import CliRunner
 
 from tiny import BOARD_IDS, RUN, record
 
-TEXTS = ["<script>alert(1)</script>", "<b onmouseover=alert(1)>", "\"'><img src=http://x>", "| a | b |",
-         "{{ 7*109300 }}", "{% raw %}", "[a](http://x)", "](http://x)", "`<b>`", "&lt;b&gt;", "--><b>", "]]><b>",
-         "\x1b[2J", "\u202eevil", "a\u2028b", "\u200bz"]
+TEXTS = ["<script>alert(1)</script>", "<b onmouseover=alert(1)>", "\"'><img src=http://x>", "| a | b |", "{{ 7*7 }}",
+         "{% raw %}", "[a](http://x)", "](http://x)", "`<b>`", "&lt;b&gt;", "--><b>", "]]><b>", "\x1b[2J", "\u202eevil",
+         "a\u2028b", "\u200bz", "=1+1"]
 UNSEEN = r"[\x00-\x08\x0b-\x1f\x7f-\x9f\u200b-\u200f\u2028-\u202e\u2066-\u2069]"
 
 
@@ -38,7 +38,7 @@ def hostile(text):
     return [with_content_hash(odd), plain, record("homogeneous", [0.2, 0.3, 0.2], role="floor")]
 
 
-@pytest.mark.parametrize("text", [" ".join(TEXTS), "=1+1"], ids=["all", "formula"])
+@pytest.mark.parametrize("text", TEXTS)
 def test_text_stays_text(text, tmp_path):
     """Site, HTML report and Markdown contain no tag, link or hidden character of the text."""
     records = hostile(text)
@@ -50,7 +50,7 @@ def test_text_stays_text(text, tmp_path):
         assert not re.search(UNSEEN, page), path
         assert all("onmouseover" not in attributes for _, attributes in parsed.tags)
         assert not any("http://x" in address for name in ("src", "href") for address in parsed.attributes(name))
-        assert [tag for tag, _ in parsed.tags].count("script") == 1 and "765100" not in page
+        assert [tag for tag, _ in parsed.tags].count("script") == 1 and "49" not in re.findall(r">(49)<", page)
         assert not re.search(r"<b>\s*[^\d−-]", page), path
     assert sanitize(text) in "".join(Page(pages["methods/odd.html"].replace("<wbr/>", "")).text)
     texts = render(site)
