@@ -313,17 +313,22 @@ def substitute_back(start, first_row, rows, panel, factor, solution):
 
 
 @njit(cache=True)
-def subtract_gradient_products(cells, unknowns, gradient, fields, table, G):
+def subtract_gradient_products(cells, unknowns, gradient, fields, mixtures, table, G, left):
     """Subtract `Sensitivity`'s integrals from ``table``, cell by cell.
 
     Weighted gradients by a cell's unknowns (cells, vertices·dim, unknowns per cell); fields
-    (unknowns, width) and table (nodes, width, width), with width a multiple of eight; ``G`` is
-    working memory of twice (vertices, dim, width).
+    (unknowns, width), mixtures (k, width) and table (nodes, k, width), with width a multiple of
+    eight; without mixtures (0, width), k is width. Working memory: ``G`` of twice
+    (vertices, dim, width), and ``left`` of twice (vertices, dim, k) for mixtures.
     """
     n_cells, n_vertices = cells.shape
     n_rows, n_local = gradient.shape[1:]
     dim = n_rows // n_vertices
     width = fields.shape[1]
+    mixed = len(mixtures) > 0
+    n_left = len(mixtures) if mixed else width
+    if not mixed:
+        left = G
     u = fields.reshape(-1)
     out = table.reshape(-1)
     size = dim * width                                   # numbers per vertex
@@ -343,28 +348,36 @@ def subtract_gradient_products(cells, unknowns, gradient, fields, table, G):
             for j in range(n_vertices):
                 to = j * size + i
                 store(G, shifted + to, subtract_product(total, splat(-1.0), load(G, to)))
-        for m in range(width):
+        if mixed:
+            for r in range(2 * n_rows):
+                for m in range(n_left):
+                    value = 0.0
+                    for i in range(width):
+                        value += mixtures[m, i] * G[r * width + i]
+                    left[r * n_left + m] = value
+        for m in range(n_left):
             for l in range(0, width, 2 * WIDTH):         # sixteen at a time, if width allows
                 twin = min(l + WIDTH, width - WIDTH)
                 everywhere = splat(0.0)
                 everywhere_twin = splat(0.0)
                 i = 0
+                k = m
                 for _ in range(n_rows):
-                    left = splat(G[i + m])
-                    everywhere = subtract_product(everywhere, left, load(G, i + l))
-                    everywhere_twin = subtract_product(everywhere_twin, left, load(G, i + twin))
+                    first = splat(left[k])
+                    everywhere = subtract_product(everywhere, first, load(G, i + l))
+                    everywhere_twin = subtract_product(everywhere_twin, first, load(G, i + twin))
                     i += width
+                    k += n_left
                 for j in range(n_vertices):
-                    to = (cells[c, j] * width + m) * width
+                    to = (cells[c, j] * n_left + m) * width
                     total = subtract_product(load(out, to + l), splat(-1.0), everywhere)
                     other = subtract_product(load(out, to + twin), splat(-1.0), everywhere_twin)
-                    i = j * size
-                    for _ in range(dim):
-                        for part in (i, shifted + i):
-                            left = splat(G[part + m])
-                            total = subtract_product(total, left, load(G, part + l))
-                            other = subtract_product(other, left, load(G, part + twin))
-                        i += width
+                    for r in range(j * dim, j * dim + dim):
+                        for part in (r, n_rows + r):
+                            first = splat(left[part * n_left + m])
+                            i = part * width
+                            total = subtract_product(total, first, load(G, i + l))
+                            other = subtract_product(other, first, load(G, i + twin))
                     store(out, to + l, total)
                     store(out, to + twin, other)
 

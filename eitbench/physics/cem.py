@@ -114,6 +114,11 @@ class CompleteElectrodeModel:
                   currents: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return `voltages` and `jacobian` from one factorisation."""
         currents = self._checked_currents(currents)
+        if 0 < len(currents) <= self.n_electrodes // 4:  # a filter's step: faster than the table
+            fields, grounded = self._fields(conductivity)
+            derivatives = self._sensitivity(fields @ self._centre.T, currents)
+            jacobian = np.ascontiguousarray(np.moveaxis(derivatives, 0, 2))
+            return currents @ self._centred(grounded), jacobian
         resistance, table = self.transfer_resistance_derivatives(conductivity)
         # (L, L·n_nodes), so that one product gives all Jacobians in their final memory order
         by_node = np.ascontiguousarray(table.reshape(len(table), -1).T)

@@ -251,6 +251,10 @@ def test_jacobian(dim, order):
     voltages, again = cem.linearise(sigma, currents)
     assert_allclose(again, jacobian, rtol=1e-14)
     assert_allclose(voltages, cem.voltages(sigma, currents), rtol=1e-14)
+    for k, pattern in enumerate(currents):              # one pattern is computed without the table
+        value, row = cem.linearise(sigma, pattern[None])
+        assert_allclose(value[0], voltages[k], rtol=1e-14)
+        assert_allclose(row[0], jacobian[k], rtol=1e-12, atol=1e-14 * np.abs(jacobian).max())
 
 
 # -- the pipe's meshes ------------------------------------------------------------------------------------------------
