@@ -236,15 +236,11 @@ def _run_policy(env: InjectionEnv, policy: Method, seed: int) -> EpisodeRun:
         if (error := env.error) is not None:
             means, stds = env.core.estimate()
             scored.append((t, error, means[0], stds[0], env.core.innovations()[0],
-                           env.core.positions()))
-    states, errors, mean, std, innovations, positions = zip(*scored, strict=True)
+                           env.core.body()))
+    states, errors, mean, std, innovations, bodies = zip(*scored, strict=True)
     world = env.core.world
-    distances = None
-    if env.rules.tracks_body:
-        path = world.target.path(world, episode_streams(seed).flow)
-        present = path.present[list(states)]
-        off = np.concatenate(positions) - path.centres[list(states)]
-        distances = np.hypot(*off[present].T) if present.any() else None
+    tracked = _bodies(world, seed, list(states), np.concatenate(bodies)) \
+        if env.rules.tracks_body else None
     interpolation, mass = region_operators(world)
     used = [each for each in innovations if each is not None]       # None: all were rejected
     outcome = Outcome(
@@ -252,10 +248,18 @@ def _run_policy(env: InjectionEnv, policy: Method, seed: int) -> EpisodeRun:
         n_injections=sum(bool(each.any()) for each in currents),
         mean=(interpolation @ np.array(mean).T).T, std=(interpolation @ np.array(std).T).T,
         truth=simulate(world, seed, progress=False).concentration[list(states)].astype(float),
-        mass=mass, points=truth_mesh(world).points, distances=distances,
+        mass=mass, points=truth_mesh(world).points, bodies=tracked,
         innovations=([each.value for each in used],
                      [each.covariance for each in used]) if used else None)
     return EpisodeRun(outcome, np.array(currents), {}, actions, total)
+
+
+def _bodies(world: World, seed: int, states: list[int],
+            estimates: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return `Outcome.bodies` from the `BODY` (S, 9) estimated in the scored states."""
+    path = world.target.path(world, episode_streams(seed).flow)
+    distances = np.hypot(*(estimates[:, :2] - path.centres[states]).T)
+    return distances, estimates[:, -1] >= 0.5, path.present[states]
 
 
 def iter_injections(env: InjectionEnv, policy: Method, seed: int,

@@ -252,10 +252,9 @@ class InjectionCore(EpisodeCore):
         agents; None without an injection or an accepted measurement."""
         return self._filters.innovations()
 
-    def positions(self) -> np.ndarray | None:
-        """Return the estimated positions (B, 2) of the bodies in m; None without a body."""
-        body = self._filters.body()
-        return None if body is None else body[:, :2]
+    def body(self) -> np.ndarray | None:
+        """Return the estimated `BODY` of each episode (B, 9); None without a body."""
+        return self._filters.body()
 
     def action_masks(self) -> np.ndarray:
         """Return (B, actions) bool: actions that have an effect. When the budget is used up, only

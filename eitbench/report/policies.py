@@ -89,6 +89,10 @@ def gap_text(rows: pd.DataFrame) -> str:
     with suppress(ValueError):
         adaptive, open_loop, *ratio = adaptive_ratio(rows)
         texts.append(f"error of {adaptive} / {open_loop}: {_with_interval(*ratio)}")
+    with suppress(KeyError, ValueError):        # of worlds with a body that moves by itself
+        adaptive, open_loop, *ratio = adaptive_ratio(
+            rows.assign(error=pd.to_numeric(rows["ospa"])**2))
+        texts.append(f"mean squared OSPA of {adaptive} / {open_loop}: {_with_interval(*ratio)}")
     with suppress(ValueError):
         texts.append(f"normalised adaptivity gap {_with_interval(*adaptivity_gap(rows))}")
     episodes = f" over {rows['seed'].nunique()} episodes"

@@ -289,6 +289,14 @@ def test_adaptive_ratio_is_the_ratio_of_means():
         adaptive_ratio(hand_made(random_pair=[1.0], best_pair=[2.0]))
 
 
+def test_the_text_has_the_ratio_of_mean_squared_ospa():
+    """It is given for policies with the score of a body."""
+    table = hand_made(mine=[1.0] * 9, best_cycle=[2.0] * 9)
+    assert "OSPA" not in gap_text(table.assign(ospa=None))
+    found = gap_text(table.assign(ospa=2.0 * table["error"]))
+    assert "mean squared OSPA of mine / best_cycle: 0.25 (95 % interval 0.25 to 0.25)" in found
+
+
 def test_the_interval_of_the_adaptivity_gap_is_student_s():
     """The interval of the ratio of means is linearised; plain percentiles are 8 % narrower at n = 12."""
     random = np.random.default_rng(5)

@@ -59,17 +59,22 @@ def test_solute_flow():
     assert said["solute_amount_error"] == pytest.approx(2 / 7)
 
 
-def test_positions_of_a_body():
-    """Distances 1, 3 and 50 mm: the median is 3 mm, and a third of the states are lost."""
-    said = compute_scores("injection", outcome(distances=np.array([0.001, 0.05, 0.003])))
-    assert (said["position_error"], said["lost_fraction"]) == (pytest.approx(0.003), pytest.approx(1 / 3))
+def test_bodies():
+    """A body is found at 1, 50 and 3 mm, missed, and falsely claimed; in the last state there is none, as
+    estimated. OSPA with a cutoff of 40 mm is √((1 + 1600 + 9 + 1600 + 1600 + 0)/6) mm."""
+    bodies = (np.array([0.001, 0.05, 0.003, 0.002, 0.01, 0.1]),
+              np.array([True, True, True, False, True, False]),
+              np.array([True, True, True, True, False, False]))
+    said = compute_scores("injection", outcome(bodies=bodies))
+    assert (said["position_error"], said["lost_fraction"]) == (pytest.approx(0.0025), pytest.approx(1 / 4))
+    assert said["ospa"] == pytest.approx(1e-3 * (4810 / 6)**0.5)
 
 
 def test_policies_have_theirs():
     """Policies have error, injections, time, and scores of the filter's uncertainty if it is available."""
     said = compute_scores("injection", Outcome(WORLD, 0.5, np.array([0.1, 0.3]), n_injections=7))
     claims = dict.fromkeys(("nis", "crps", "coverage_50", "coverage_90", "spread_ratio",
-                           "position_error", "lost_fraction"))
+                           "position_error", "lost_fraction", "ospa"))
     assert said == claims | {"error": pytest.approx(0.2), "spent": 7.0, "seconds_per_step": 0.5}
 
 
