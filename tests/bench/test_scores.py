@@ -60,8 +60,8 @@ def test_solute_flow():
 
 
 def test_bodies():
-    """A body is found at 1, 50 and 3 mm, missed, and falsely claimed; in the last state there is none, as
-    estimated. OSPA with a cutoff of 40 mm is √((1 + 1600 + 9 + 1600 + 1600 + 0)/6) mm."""
+    """A body is estimated 1, 50 and 3 mm off, then missed; of two absent ones the first is estimated to be
+    present. OSPA with a cutoff of 40 mm is √((1 + 1600 + 9 + 1600 + 1600 + 0)/6) mm."""
     bodies = (np.array([0.001, 0.05, 0.003, 0.002, 0.01, 0.1]),
               np.array([True, True, True, False, True, False]),
               np.array([True, True, True, True, False, False]))
