@@ -3,8 +3,6 @@ few cores are slower, not faster)."""
 
 import hashlib
 import os
-import pickle
-from functools import lru_cache
 from pathlib import Path
 
 import pytest
@@ -64,28 +62,9 @@ def run_cache(pytestconfig, tmp_path_factory):
     return str(kept.mkdir(f"episodes-{code.hexdigest()[:16]}"))
 
 
-def keep_in(folder, solve):
-    """Return a function that solves, or reads the result of another process for equal arguments."""
-    from eitbench._files import write_atomically
-
-    @lru_cache
-    def kept(*arguments):
-        digest = hashlib.sha256(repr(arguments).encode()).hexdigest()[:16]
-        path = Path(folder, f"{solve.__name__}-{digest}.pickle")
-        if not path.exists():
-            write_atomically(path, pickle.dumps(solve(*arguments)))
-        return pickle.loads(path.read_bytes())
-
-    return kept
-
-
 @pytest.fixture(scope="session", autouse=True)
 def nobodys_own_cache(run_cache):
-    """Use this cache folder in tests that set none, instead of the developer's, also for solutions of
-    the Navier–Stokes equations, which take 15 s for the obstacle."""
-    from eitbench.worlds import flows
+    """Use this cache folder in tests that set none, instead of the developer's."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("EITBENCH_CACHE", run_cache)
-        for solve in (flows._past_bulge, flows._stirred):
-            patch.setattr(flows, solve.__name__, keep_in(run_cache, solve))
         yield

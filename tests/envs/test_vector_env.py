@@ -119,9 +119,10 @@ def test_images_are_those_of_scalar_environments():
         make(render_mode="rgb_array").render()
 
 
-def test_observations_are_fresh_and_within_their_space():
+@each_lag
+def test_observations_are_fresh_and_within_their_space(name):
     """Writing to an observation does not change later ones."""
-    envs = make(LAGGED)
+    envs = make(name)
     actions = actions_for(envs, 30)
     untouched = play(envs, actions, seed=1)
     given = [*untouched[0][0].values(), *untouched[0][4].values()]
@@ -141,12 +142,13 @@ def test_observations_are_fresh_and_within_their_space():
         assert_same_play([step], [expected])
 
 
-def test_made_again_from_its_specification():
+@each_lag
+def test_made_again_from_its_specification(name):
     """An environment can be made from its EnvSpec, from JSON, from the scalar environment's spec, or by pickle."""
-    envs = make(LAGGED)
+    envs = make(name)
     actions = actions_for(envs, 20)
     played = play(envs, actions, seed=1)
-    scalar = gym.make(LAGGED, **short(LAGGED) | {"episodes": 3}).spec
+    scalar = gym.make(name, **short(name) | {"episodes": 3}).spec
     through_json = EnvSpec.from_json(envs.spec.to_json())
     copies = [gym.make_vec(envs.spec), gym.make_vec(through_json),
               gym.make_vec(scalar, num_envs=3), pickle.loads(pickle.dumps(envs))]

@@ -32,14 +32,14 @@ def test_method_and_score_make_a_record_and_a_board(installed):
     methods = ("homogeneous", "bubble_tracker", "gauss_newton")
     installed.commands([
         (["list"], ID), (["list"], INJECTION),
-        *((["submit", "--baseline", method, "--env", ID, "--seeds", "test:0", "--to", records, "--jobs", 1], method)
+        *((["submit", "--baseline", method, "--env", ID, "--seeds", "test:0-1", "--to", records, "--jobs", 1], method)
           for method in methods),
         (["leaderboard", "--records", records], "wrote"),
         (["compare", "bubble_tracker", "gauss_newton", "--records", records, "--score", "bubble_distance"],
          "distance of A"),
-        (["verify", "--top", 1, "--records", records, "--episodes", 1, "--jobs", 1], "1 of 1 records agree"),
-        (["run", "--env", INJECTION, "--policy", "opposite", "--seeds", "dev:0", "--estimator", "reduced", "--out",
-          "played", "--jobs", 1], "opposite"),
+        (["verify", "--top", 2, "--records", records, "--episodes", 1, "--jobs", 1], "2 of 2 records agree"),
+        (["run", "--env", INJECTION, "--policy", "random_pair", "--policy", "opposite", "--seeds", "dev:0",
+          "--estimator", "reduced", "--out", "played", "--jobs", 1], "opposite"),
         (["render", "--env", ID, "--baseline", "bubble_tracker", "--step", 20, "--out", "bubble.png"], "wrote"),
     ])
     scores = {}

@@ -33,6 +33,7 @@ COMMANDS = [
     (("leaderboard", "--records", "mine/results"), "wrote mine/site/index.html"),
     (("verify", f"two/{RECORD}", "--episodes", "1", "-j", "1"), "1 of 1 records agree"),
     (("verify", "--all", "--records", "two", "--episodes", "1", "-j", "1"), "StationaryTank2D"),
+    (("compare", "kalman_filter", "extended_kalman_filter"), "extended_kalman_filter"),
     (("compare", f"two/{RECORD}", "kalman_filter"), "kalman_filter"),
     (("render", *TANK, "--baseline", "homogeneous", "--step", "3", "-o", "it.png"), "wrote it.png"),
     (("golden", "eitbench/StationaryTank2D-v0", "homogeneous"), "homogeneous: same"),

@@ -5,7 +5,7 @@ from eitbench.measured import vessel
 from eitbench.numerics.round_meshes import electrode_disc, uniform_disc
 from eitbench.physics.cem import CompleteElectrodeModel
 from eitbench.worlds.vessels import RoundTank
-from tanks import FIXED_STDS, VESSEL, moving
+from tanks import VESSEL, moving
 
 
 def small_electrode_model(tank, fine):
@@ -33,4 +33,4 @@ def measurements():
 
 @pytest.fixture(scope="module")
 def env(coarse, measurements):
-    return MeasuredEnv(measurements, VESSEL, withheld=0.15, **FIXED_STDS)
+    return MeasuredEnv(measurements, VESSEL, withheld=0.15)

@@ -128,7 +128,7 @@ def submitted(folder):
     method_file = write_baseline(folder, "mine", update="return Estimate(1.1 * self.level)")
     for method, *seeds in (("homogeneous",), (method_file, "--seeds", "test:0")):
         code, _, err = eitbench("submit", "--env", ID, "--baseline", method, "--to", folder / "results",
-                                "--out", folder / "store", "--jobs", 1, "--isolate", "none", *seeds)
+                                "--out", folder / "store", "--jobs", 1, *seeds)
         assert code == 0, err
     return folder / "results"
 

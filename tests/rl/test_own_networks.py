@@ -104,8 +104,7 @@ def test_a_model_of_stable_baselines3_is_an_agent(estimator, tmp_path):
     assert method.name.startswith("ppo_") and method.parameters == {"env": NAME, "total_steps": 16}
     actions, seen = rollout(method, estimator=estimator)
     assert [int(each) for each in actions] == [int(model.predict(each, deterministic=True)[0]) for each in seen]
-    if estimator == "reduced":                               # scores have the full filter in any case
-        assert assert_submits(path, NAME, tmp_path)["method"] == method.name
+    assert assert_submits(path, NAME, tmp_path)["method"] == method.name
 
 
 def test_names_of_saved_agents(tmp_path):
