@@ -94,6 +94,19 @@ def deficit_centroid(values: np.ndarray, points: np.ndarray, weights: np.ndarray
     return centre
 
 
+def ospa(distances: np.ndarray, estimated: np.ndarray, present: np.ndarray,
+         cutoff: float) -> float:
+    """Compute the root mean square of the OSPA distance in m of one body over T states
+    (Schuhmacher, Vo & Vo, IEEE Trans. Signal Process. 56, 2008, order 2).
+
+    It is the position error ``distances`` (T,) in m, at most ``cutoff`` in m, where the body is
+    ``estimated`` to be present and is ``present`` (T,), and the cutoff where only one is true.
+    """
+    both = np.where(estimated & present, np.minimum(distances, cutoff), 0.0)
+    errors = np.where(estimated != present, cutoff, both)
+    return float(np.sqrt((errors**2).mean()))
+
+
 def _pair(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     a = np.asarray(a, dtype=float)
     b = np.asarray(b, dtype=float)

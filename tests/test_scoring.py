@@ -11,6 +11,7 @@ from eitbench.scoring import (
     deficit_centroid,
     normalised_innovations,
     normalised_score,
+    ospa,
     relative_error,
     spread_ratio,
     step_errors,
@@ -139,6 +140,15 @@ def test_arrays_must_be_a_pair_over_time_and_space(score, left, right):
     """Arrays are not broadcast: both are (T, n), or an error contains both shapes."""
     with pytest.raises(ValueError, match=r"same shape \(T, n\)"):
         score(np.ones(left), np.ones(right))
+
+
+def test_ospa_of_one_body():
+    """A body is estimated 1, 50 and 3 mm off, then missed; of two absent ones the first is estimated to be
+    present: √((1 + 1600 + 9 + 1600 + 1600 + 0)/6) mm."""
+    distances = 1e-3 * np.array([1.0, 50.0, 3.0, 2.0, 10.0, 100.0])
+    estimated = np.array([True, True, True, False, True, False])
+    present = np.array([True, True, True, True, False, False])
+    assert ospa(distances, estimated, present, 0.04) == pytest.approx(1e-3 * (4810 / 6)**0.5)
 
 
 def plate():

@@ -17,7 +17,7 @@ from eitbench import _check, scoring
 from eitbench.bench.isolation import Worker
 from eitbench.bench.measured import MeasuredRun
 from eitbench.bench.methods import Method, load_method
-from eitbench.bench.scores import Outcome
+from eitbench.bench.scores import LOST_DISTANCE, Outcome
 from eitbench.bench.tracks import Environment, check_track, is_measured, subtrack_of
 from eitbench.data.episode_cache import region_operators, truth_mesh
 from eitbench.data.episodes import cached_truth_model, simulate
@@ -239,8 +239,13 @@ def _run_policy(env: InjectionEnv, policy: Method, seed: int) -> EpisodeRun:
                            env.core.body()))
     states, errors, mean, std, innovations, bodies = zip(*scored, strict=True)
     world = env.core.world
-    tracked = _bodies(world, seed, list(states), np.concatenate(bodies)) \
-        if env.rules.tracks_body else None
+    distances = ospa = None
+    if env.rules.tracks_body:
+        path = world.target.path(world, episode_streams(seed).flow)
+        body, present = np.concatenate(bodies), path.present[list(states)]
+        off = np.hypot(*(body[:, :2] - path.centres[list(states)]).T)
+        distances = off[present] if present.any() else None
+        ospa = scoring.ospa(off, body[:, -1] >= 0.5, present, LOST_DISTANCE)
     interpolation, mass = region_operators(world)
     used = [each for each in innovations if each is not None]       # None: all were rejected
     outcome = Outcome(
@@ -248,18 +253,11 @@ def _run_policy(env: InjectionEnv, policy: Method, seed: int) -> EpisodeRun:
         n_injections=sum(bool(each.any()) for each in currents),
         mean=(interpolation @ np.array(mean).T).T, std=(interpolation @ np.array(std).T).T,
         truth=simulate(world, seed, progress=False).concentration[list(states)].astype(float),
-        mass=mass, points=truth_mesh(world).points, bodies=tracked,
+        mass=mass, points=truth_mesh(world).points, distances=distances,
+        ospa=ospa,
         innovations=([each.value for each in used],
                      [each.covariance for each in used]) if used else None)
     return EpisodeRun(outcome, np.array(currents), {}, actions, total)
-
-
-def _bodies(world: World, seed: int, states: list[int],
-            estimates: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return `Outcome.bodies` from the `BODY` (S, 9) estimated in the scored states."""
-    path = world.target.path(world, episode_streams(seed).flow)
-    distances = np.hypot(*(estimates[:, :2] - path.centres[states]).T)
-    return distances, estimates[:, -1] >= 0.5, path.present[states]
 
 
 def iter_injections(env: InjectionEnv, policy: Method, seed: int,

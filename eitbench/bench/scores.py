@@ -64,9 +64,10 @@ class Outcome:
     """(S, p) estimated and true m/s, and weights (p,), where the task includes the flow"""
     solute_flow: tuple[np.ndarray, np.ndarray] | None = None
     """(S,) estimated and true flow of solute through a pipe's outlet, mol/s (mol/(s·m) in 2D)"""
-    bodies: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None
-    """distances (S,) in m between the estimated and the true position of a body, and whether it is
-    estimated to be present, and is present, (S,) bool each"""
+    distances: np.ndarray | None = None
+    """m, between the estimated and the true position in each scored state with a body"""
+    ospa: float | None = None
+    """m, `scoring.ospa` of a body with the cutoff `LOST_DISTANCE`"""
     mean_nis: float | None = None
     """NIS/m of measurements"""
     ktc: float | None = None
@@ -212,29 +213,6 @@ def _nis(outcome: Any) -> float | None:
     return float(np.mean(each))
 
 
-def _present_distances(outcome: Any) -> np.ndarray | None:
-    """Return the distances in m of the states with a body."""
-    distances, _, present = outcome.bodies
-    return distances[present] if present.any() else None
-
-
-def _position_error(outcome: Any) -> float | None:
-    distances = _present_distances(outcome)
-    return None if distances is None else float(np.median(distances))
-
-
-def _lost_fraction(outcome: Any) -> float | None:
-    distances = _present_distances(outcome)
-    return None if distances is None else float((distances > LOST_DISTANCE).mean())
-
-
-def _ospa(outcome: Any) -> float:
-    distances, estimated, present = outcome.bodies
-    each = np.where(estimated & present, np.minimum(distances, LOST_DISTANCE),
-                    LOST_DISTANCE * (estimated != present))
-    return float(np.sqrt((each**2).mean()))
-
-
 def _uncertainty(outcome: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Return the arguments of the functions in `scoring` for the reported uncertainty."""
     return outcome.mean, outcome.std, outcome.truth, outcome.weights
@@ -273,16 +251,18 @@ for _score in (
           _solute_amount_error, requires=("solute_flow",)),
     Score("position_error", "position",
           "median distance between the estimated and the true position of a body, mm",
-          _position_error, requires=("bodies",), tracks=("injection",), factor=1e3),
+          lambda outcome: float(np.median(outcome.distances)), requires=("distances",),
+          tracks=("injection",), factor=1e3),
     Score("lost_fraction", "lost",
           f"fraction of the states with a body whose estimated position is off by more than "
           f"{1e3 * LOST_DISTANCE:g} mm",
-          _lost_fraction, requires=("bodies",), tracks=("injection",)),
+          lambda outcome: float((outcome.distances > LOST_DISTANCE).mean()),
+          requires=("distances",), tracks=("injection",)),
     Score("ospa", "OSPA",
           f"OSPA distance of a body's estimate (Schuhmacher et al. 2008, order 2), mm: RMS over "
           f"the states of the position error, at most {1e3 * LOST_DISTANCE:g} mm; a missed or a "
           f"false body counts as much",
-          _ospa, requires=("bodies",), tracks=("injection",), factor=1e3),
+          lambda outcome: outcome.ospa, tracks=("injection",), factor=1e3),
     Score("coverage_50", "50 %", "fraction of the truth inside the reported 50 % interval",
           lambda outcome: scoring.coverage(*_uncertainty(outcome), 0.5),
           direction="nominal", requires=("std",), tracks=TRACKS),

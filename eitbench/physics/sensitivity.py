@@ -40,16 +40,15 @@ class Sensitivity:
         """Return −∫ φ_j ∇v_i·∇w_l (n_nodes, m, k) for potentials w (n_potential, k), and their
         combinations v with weights ``mixtures`` (m, k); by default v is w."""
         k = fields.shape[1]
-        m = k if mixtures is None else len(mixtures)
         width = -(-k // 8) * 8
         padded = aligned_zeros((len(fields), width))
         padded[:, :k] = fields
-        weights = np.zeros((0 if mixtures is None else m, width))
+        weights = np.zeros((0 if mixtures is None else len(mixtures), width))
         weights[:, :k] = 0.0 if mixtures is None else mixtures
-        table = aligned_zeros((self._cells.max() + 1, m if len(weights) else width, width))
+        table = aligned_zeros((self._cells.max() + 1, len(weights) or width, width))
         rows = 2 * self._gradient.shape[1]
         memory = scratch(rows * (width + len(weights)))
         compiled_kernels().subtract_gradient_products(
             self._cells, self._unknowns, self._gradient, padded, weights, table,
             memory[:rows * width], memory[rows * width:])
-        return table[:, :m, :k]
+        return table[:, :len(weights) or k, :k]
