@@ -7,8 +7,6 @@ from eitbench.envs.measured import MeasuredEnv
 from eitbench.estimation.walk import matern32_transition, matern_modes
 from tanks import FIXED_STDS, VESSEL, moving
 
-pytestmark = pytest.mark.usefixtures("coarse")
-
 
 def test_correlation_is_matern():
     """The correlation is (1 + λτ) e^−λτ; short steps compose to a long step, and the variance is stationary."""
