@@ -47,9 +47,9 @@ def flatten_scaled(rules: Rules, observation: Observation) -> np.ndarray:
         parts += [2.0 * (observation["velocity"] / flow.nominal - 1.0),
                   observation["velocity_std"] / flow.initial_std]
     if rules.tracks_body:
-        length, speed = world.vessel.radius, world.target.speed_range[1]
+        centre, speed = world.target.limits(world)
         spread = world.target.radius_range[1]
-        parts.append(observation["body"] / ([length] * 2 + [speed] * 2 + [spread] * 2 + [1.0] * 3))
+        parts.append(observation["body"] / (*centre, speed, speed, spread, spread, 1.0, 1.0, 1.0))
     batch = observation["voltages"].shape[:-1]
     flat = np.concatenate([part.reshape(*batch, -1) for part in parts], axis=-1)
     return np.clip(flat, -MAX_SCALED, MAX_SCALED).astype(np.float32)

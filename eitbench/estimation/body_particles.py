@@ -1,4 +1,4 @@
-"""Particle filters of the position of a body in a round tank, for batches of episodes."""
+"""Particle filters of the position of a moving body, for batches of episodes."""
 
 from __future__ import annotations
 
@@ -9,25 +9,16 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 import scipy.sparse as sp
 
+from eitbench.estimation.body_motion import SPACING, body_motion
 from eitbench.numerics.compiled import compiled_kernels
 from eitbench.numerics.fem import mass_matrix
-from eitbench.worlds.bodies import (
-    DISC_POINTS,
-    DISC_WEIGHTS,
-    TRANSITION_WIDTH,
-    disc_indicator,
-    reflect,
-)
+from eitbench.worlds.bodies import DISC_POINTS, DISC_WEIGHTS, TRANSITION_WIDTH, disc_indicator
 from eitbench.worlds.task import Estimate
 
 if TYPE_CHECKING:
     from eitbench.physics.observation import ObservationModel
     from eitbench.worlds.task import Task
 
-SPACING = 5e-3
-"""m, spacing of the grid on which signals and images of a body are tabulated."""
-SIGNAL_ERROR = 0.05
-"""Standard deviation of the error of a body's signal, relative to the signal."""
 POSITION_JITTER = 1e-3
 """m, standard deviation of the movement of a resampled particle."""
 AREA_WALK = 0.02
@@ -42,11 +33,11 @@ class Particles(NamedTuple):
     centres: np.ndarray
     """(B, P, 2) m"""
     velocities: np.ndarray
-    """(B, P, 2) m/s"""
+    """(B, P, 2) m/s relative to the liquid"""
     areas: np.ndarray
     """(B, P) area of the body relative to the mean one"""
     present: np.ndarray
-    """(B, P) bool: whether the body is in the tank"""
+    """(B, P) bool: whether the body is in the vessel"""
 
 
 class BodyModel:
@@ -55,23 +46,18 @@ class BodyModel:
     The signal of a disc is the linearised one times the ratio 2/(1 + k) of an exact and a
     linearised dipole, with k the ratio of the conductivities, and proportional to its area. With
     the best area it is within 6 % of the complete electrode model up to three radii from the wall,
-    and within 12 % at half of that. The motion is an Ornstein–Uhlenbeck velocity with the speed and
-    the run time of the target.
+    and within 12 % at half of that.
     """
 
     def __init__(self, task: Task) -> None:
         assert task.body is not None, "the task must have a body"
         self.target = target = task.body
-        vessel: Any = task.vessel
         observation, mesh = task.observation, task.mesh
-        self.noise, self.time_step = task.noise, task.transport.time_step
+        self.noise, self.motion = task.noise, body_motion(task)
         self.radius = float(np.mean(target.radius_range))
-        self.limit = vessel.radius - self.radius
-        self.side = 2 * math.ceil(self.limit / SPACING) + 1
-        """grid points along x and y"""
-        axis = SPACING * (np.arange(self.side) - self.side // 2)
-        grid = np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2)
-        grid, _ = reflect(grid, grid, self.limit)
+        axes = (SPACING * (np.arange(count) - origin)
+                for count, origin in zip(self.motion.shape, self.motion.origin, strict=True))
+        grid = self.motion.within(np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 2))
         discs = np.array([disc_indicator(mesh.points, centre, self.radius, TRANSITION_WIDTH)
                           for centre in grid])
         # a coarse mesh distorts the area of a small disc
@@ -86,14 +72,8 @@ class BodyModel:
         discs[discs < 1e-3] = 0.0
         self.images = sp.csc_array((contrast * target.background * discs).T)
         """(n, G) change of the concentration by a disc at each grid point in mol/m³"""
-        low, high = target.speed_range
-        self.speed = math.sqrt((low**2 + low * high + high**2) / 6.0)
-        """m/s, standard deviation of each component of the velocity"""
-        self.decay = math.exp(-self.time_step / target.run_time)
         self.log_area_std = (math.log(target.radius_range[1] / target.radius_range[0])
                              / math.sqrt(3.0))
-        self.leave, self.enter = (-math.expm1(-self.time_step / time)
-                                  for time in (target.visit_time, target.absence_time))
 
     def __deepcopy__(self, memo: dict[int, Any]) -> BodyModel:
         return self
@@ -111,31 +91,32 @@ class BodyModel:
                           for weight, point in zip(DISC_WEIGHTS, DISC_POINTS, strict=True)).T
 
     def draw(self, random: np.random.Generator, count: int) -> tuple[np.ndarray, ...]:
-        """Draw centres, velocities and areas of new particles, (count, …)."""
-        angle = random.uniform(0.0, 2.0 * np.pi, count)
-        distance = self.limit * np.sqrt(random.uniform(size=count))
-        return (np.stack([distance * np.cos(angle), distance * np.sin(angle)], axis=1),
-                self.speed * random.standard_normal((count, 2)),
+        """Draw centres, velocities and areas of particles at the start, (count, …)."""
+        return self.motion.draw(random, count), *self._draw_rest(random, count)
+
+    def _draw_rest(self, random: np.random.Generator, count: int) -> tuple[np.ndarray, np.ndarray]:
+        motion = self.motion
+        return (motion.mean_velocity + motion.velocity_std * random.standard_normal((count, 2)),
                 np.exp(self.log_area_std * random.standard_normal(count)))
 
     def move(self, particles: Particles, random: np.random.Generator) -> Particles:
         """Move particles by a time step, with the same random numbers in all episodes."""
         centres, velocities, areas, present = particles
+        motion = self.motion
         B, P = areas.shape
         noise = random.standard_normal((P, 3))
-        velocities = (self.decay * velocities
-                      + math.sqrt(1.0 - self.decay**2) * self.speed * noise[:, :2])
+        velocities = (motion.mean_velocity + motion.decay * (velocities - motion.mean_velocity)
+                      + np.sqrt(1.0 - motion.decay**2) * motion.velocity_std * noise[:, :2])
         areas = areas * np.exp(AREA_WALK * noise[:, 2])
-        centres, velocities = reflect(centres + self.time_step * velocities, velocities,
-                                      self.limit)
-        if self.leave > 0.0:
-            draw = random.uniform(size=P)
-            entering = ~present & (draw < self.enter)
-            new = self.draw(random, P)
+        centres, velocities = motion.move(centres, velocities)
+        if motion.has_visits:
+            draw = np.asarray(random.uniform(size=P))
+            entering = ~present & (draw < motion.enter)
+            new = motion.entries(random, P), *self._draw_rest(random, P)
             centres, velocities, areas = (
                 np.where(entering.reshape(B, P, *(1,) * (old.ndim - 2)), each, old)
                 for old, each in zip((centres, velocities, areas), new, strict=True))
-            present = np.where(present, draw >= self.leave, entering)
+            present = np.where(present, ~motion.leaves(centres, draw), entering)
         return Particles(centres, velocities, areas, present)
 
     def cells(self, particles: Particles) -> tuple[np.ndarray, np.ndarray]:
@@ -143,8 +124,9 @@ class BodyModel:
         the area; zero for absent ones."""
         shape = (*particles.areas.shape, 4)
         index, weights = np.empty(shape, dtype=int), np.empty(shape)
-        compiled_kernels().bilinear_weights(particles.centres.reshape(-1, 2), SPACING, self.side,
-                                            index.reshape(-1, 4), weights.reshape(-1, 4))
+        compiled_kernels().bilinear_weights(
+            particles.centres.reshape(-1, 2), SPACING, self.motion.origin, self.motion.shape,
+            index.reshape(-1, 4), weights.reshape(-1, 4))
         weights *= (particles.areas * particles.present)[..., None]
         return index, weights
 
@@ -201,7 +183,7 @@ class BodyParticleFilter:
         S = ~used[:, None] * np.eye(used.shape[1])
         compiled_kernels().particle_likelihoods(
             model.signals, *model.cells(self.particles), self.weights, currents, electrodes, used,
-            residual, std**2, SIGNAL_ERROR, log_likelihood, innovation, S)
+            residual, std**2, model.motion.signal_error, log_likelihood, innovation, S)
         self.innovation = innovation, S, used
         self._reweight(log_likelihood)
         scaled = np.zeros(voltages.shape)

@@ -466,19 +466,21 @@ def _row_product(matrix, r, block):
 
 
 @njit(cache=True)
-def bilinear_weights(points, spacing, side, index, weights):
+def bilinear_weights(points, spacing, origin, shape, index, weights):
     """Compute grid points ``index`` (N, 4) about ``points`` (N, 2) and their ``weights`` (N, 4), on
-    a grid of side × side points about the origin, x first."""
+    a grid of ``shape`` (columns, rows), x first; the point (0, 0) is at column and row
+    ``origin``."""
+    columns, rows = shape
     for i in range(len(points)):
-        x = points[i, 0] / spacing + side // 2
-        y = points[i, 1] / spacing + side // 2
-        column = min(max(int(x), 0), side - 2)
-        row = min(max(int(y), 0), side - 2)
+        x = points[i, 0] / spacing + origin[0]
+        y = points[i, 1] / spacing + origin[1]
+        column = min(max(int(x), 0), columns - 2)
+        row = min(max(int(y), 0), rows - 2)
         x -= column
         y -= row
         for k in range(4):
             above, right = k // 2, k % 2
-            index[i, k] = (row + above) * side + column + right
+            index[i, k] = (row + above) * columns + column + right
             weights[i, k] = (x if right else 1.0 - x) * (y if above else 1.0 - y)
 
 

@@ -1,5 +1,5 @@
-"""Bodies in a round tank: a resistive disc in the flow, one that moves by itself, and stationary
-metal cylinders."""
+"""Bodies in the liquid: a resistive disc in the flow, one that moves by itself, bubbles that rise
+through a pipe, and stationary metal cylinders."""
 
 from __future__ import annotations
 
@@ -111,13 +111,36 @@ class BodyPath(NamedTuple):
     centres: np.ndarray
     """(T + 1, 2) m"""
     present: np.ndarray
-    """(T + 1,) bool: whether the body is in the tank"""
+    """(T + 1,) bool: whether the body is in the vessel"""
     radius: float
     """m"""
 
 
+class MovingBody(Body):
+    """A resistive disc that moves by itself and may be absent; filters estimate its position."""
+
+    background: float
+    concentration: float
+    radius_range: tuple[float, float]
+
+    def path(self, world: World, random: np.random.Generator) -> BodyPath:
+        """Draw the path of an episode."""
+        raise NotImplementedError
+
+    def limits(self, world: World) -> tuple[tuple[float, float], float]:
+        """Return the largest coordinates in m and the largest speed in m/s, for scaling."""
+        raise NotImplementedError
+
+    def states(self, world: World, points: np.ndarray, random: np.random.Generator,
+               last: int) -> np.ndarray:
+        centres, present, radius = self.path(world, random)
+        disc = np.array([there * disc_indicator(points, centre, radius, TRANSITION_WIDTH)
+                         for centre, there in zip(centres[:last + 1], present, strict=False)])
+        return self.background + (self.concentration - self.background) * disc
+
+
 @dataclass(frozen=True)
-class WanderingBody(Body):
+class WanderingBody(MovingBody):
     """A resistive disc that moves by itself in a liquid at rest. All numbers [E].
 
     It runs straight ahead and turns into a random direction, and to a random speed, at random
@@ -154,7 +177,6 @@ class WanderingBody(Body):
                              f"tank, got {self.radius_range!r} in a {type(world.vessel).__name__}")
 
     def path(self, world: World, random: np.random.Generator) -> BodyPath:
-        """Draw the path of an episode."""
         radius = random.uniform(*self.radius_range)
         limit = world.vessel.radius - radius
         dt = world.time_step
@@ -174,18 +196,96 @@ class WanderingBody(Body):
                     centre, velocity = self._place(random, limit), self._velocity(random)
         return BodyPath(np.array(centres), np.array(present), radius)
 
+    def limits(self, world: World) -> tuple[tuple[float, float], float]:
+        return (world.vessel.radius, world.vessel.radius), self.speed_range[1]
+
     def _place(self, random: np.random.Generator, limit: float) -> np.ndarray:
         return limit * math.sqrt(random.uniform()) * _direction(random)
 
     def _velocity(self, random: np.random.Generator) -> np.ndarray:
         return random.uniform(*self.speed_range) * _direction(random)
 
-    def states(self, world: World, points: np.ndarray, random: np.random.Generator,
-               last: int) -> np.ndarray:
-        centres, present, radius = self.path(world, random)
-        disc = np.array([there * disc_indicator(points, centre, radius, TRANSITION_WIDTH)
-                         for centre, there in zip(centres[:last + 1], present, strict=False)])
-        return self.background + (self.concentration - self.background) * disc
+
+@dataclass(frozen=True)
+class RisingBubble(MovingBody):
+    """Insulating bubbles that rise through a vertical plane pipe, one after the other.
+
+    Each follows the nominal flow with its own slip velocity and oscillates across the pipe. It
+    enters at a random y, a random time after the last one has left, and leaves when it reaches the
+    outlet. All numbers [E].
+    """
+
+    background: float = 30.0
+    """mol/m³, about 0.3 S/m: weak saline"""
+    radius_range: tuple[float, float] = (0.008, 0.012)
+    """m, of all bubbles of an episode"""
+    concentration: float = 1.5
+    """mol/m³: a twentieth of the background, because a P1 conductivity has to stay positive"""
+    slip_range: tuple[float, float] = (0.05, 0.5)
+    """m/s, velocity relative to the flow along the pipe"""
+    amplitude_range: tuple[float, float] = (0.0, 0.012)
+    """m, of the oscillation across the pipe"""
+    frequency_range: tuple[float, float] = (1.0, 3.0)
+    """Hz, of the oscillation"""
+    mean_wait: float = 0.2
+    """s, mean of the exponentially distributed times between bubbles"""
+
+    def __post_init__(self) -> None:
+        check_positive(self, background="mol/m³", concentration="mol/m³", mean_wait="s")
+        check_range(self, "radius_range", "m")
+        check_range(self, "slip_range", "m/s", open_low=False)
+        check_range(self, "amplitude_range", "m", open_low=False)
+        check_range(self, "frequency_range", "Hz")
+
+    def check(self, world: World) -> None:
+        """Raise ``ValueError`` unless the bubbles fit into a straight plane pipe."""
+        vessel = world.vessel
+        if getattr(vessel, "bulge", vessel) is not None:
+            raise ValueError("target must be in a PlanePipe without a bulge, got a RisingBubble "
+                             f"in {vessel!r}")
+        if world.flow.nominal(world, fine=True) is None:
+            raise ValueError("flow must be a flow through the pipe, because a RisingBubble follows "
+                             f"it, got {world.flow!r}")
+        if not self.radius_range[1] + self.amplitude_range[1] < vessel.half_width:
+            raise ValueError("target.radius_range and amplitude_range must have a sum below half "
+                             f"of the pipe's width, {vessel.half_width:g} m, got "
+                             f"{self.radius_range!r} and {self.amplitude_range!r} m")
+
+    def path(self, world: World, random: np.random.Generator) -> BodyPath:
+        vessel = world.vessel
+        radius = random.uniform(*self.radius_range)
+        flow = world.flow.nominal(world, fine=True)
+        x, wait = random.uniform(radius, vessel.length - radius), 0.0
+        slip, *motion = self._draw(random, vessel.half_width - radius)
+        centres, present = [], []
+        for t in range(world.n_steps + 1):
+            y = self._height(t * world.time_step, *motion)
+            centres.append([x, y])
+            present.append(wait <= 0.0)
+            if wait > 0.0:
+                wait -= world.time_step
+                if wait <= 0.0:
+                    x, (slip, *motion) = radius, self._draw(random, vessel.half_width - radius)
+            else:
+                x += world.time_step * (float(flow(np.array([[x, y]]))[0, 0]) + slip)
+                if x >= vessel.length - radius:
+                    wait = random.exponential(self.mean_wait)
+        return BodyPath(np.array(centres), np.array(present), radius)
+
+    def limits(self, world: World) -> tuple[tuple[float, float], float]:
+        return (world.vessel.length, world.vessel.half_width), self.slip_range[1]
+
+    def _draw(self, random: np.random.Generator, limit: float) -> tuple[float, ...]:
+        """Draw slip, amplitude, centre, frequency and phase; the bubble stays within ``limit``."""
+        amplitude = random.uniform(*self.amplitude_range)
+        return (random.uniform(*self.slip_range), amplitude,
+                (limit - amplitude) * random.uniform(-1.0, 1.0),
+                random.uniform(*self.frequency_range), random.uniform(0.0, 2.0 * math.pi))
+
+    @staticmethod
+    def _height(time: float, amplitude: float, centre: float, frequency: float,
+                phase: float) -> float:
+        return centre + amplitude * math.sin(2.0 * math.pi * frequency * time + phase)
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ import numpy as np
 
 from eitbench import _check
 from eitbench.physics.stationary import StationaryTransport
-from eitbench.worlds.bodies import WanderingBody
+from eitbench.worlds.bodies import MovingBody
 from eitbench.worlds.world import Discretisation, Prior, Vessel, World
 
 if TYPE_CHECKING:
@@ -79,8 +79,8 @@ class Task:
         Sizes and electrodes.
     world : str
         Name of the world, by which trained models are found.
-    body : WanderingBody, optional
-        Conductivity, range of sizes, and speeds of a body that moves by itself.
+    body : MovingBody, optional
+        Conductivity, sizes, and parameters of the motion of a body that moves by itself.
     """
 
     transport: Transport
@@ -96,7 +96,7 @@ class Task:
     velocity: VelocityModel | None = None
     vessel: Vessel | None = None
     world: str = ""
-    body: WanderingBody | None = None
+    body: MovingBody | None = None
 
     @property
     def mesh(self) -> Mesh:
@@ -141,7 +141,7 @@ def make_task(world: World, lag: int | str = 0, **assumed: Any) -> Task:
     return Task(model.transport, model.observation, world.instrument.model_noise, currents,
                 world.n_steps, world.warm_up, steps, world.expected_concentration,
                 world.calibration, world.prior, world.velocity_model, world.vessel, world.name,
-                world.target if isinstance(world.target, WanderingBody) else None)
+                world.target if isinstance(world.target, MovingBody) else None)
 
 
 def lag_steps(world: World, lag: int | str) -> int:

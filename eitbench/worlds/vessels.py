@@ -65,6 +65,8 @@ class PlanePipe:
     """Λ in S·m²/mol; σ = Λc is linear [T], with about the slope of NaCl [E]"""
     bulge: Bulge | None = None
     """of the lower wall"""
+    truth_refinement: int = field(default=1, metadata=ADDED_LATER)
+    """factor by which the electrode mesh of the truth is finer, for small bodies"""
 
     coarse_grid_shape = (12, 3)
     is_elongated = True
@@ -75,6 +77,7 @@ class PlanePipe:
         check_positive(self, length="m", half_width="m")
         _check_electrodes(self)
         _check.integer("electrodes_per_wall", self.electrodes_per_wall, low=2)
+        _check.integer("truth_refinement", self.truth_refinement, low=1)
         if self.bulge is not None:
             _check.number("bulge.height", self.bulge.height, high=self.half_width, units="m")
 
@@ -130,7 +133,8 @@ class PlanePipe:
         """Return a model with about 18,000 unknowns for the truth, 4,600 for the model."""
         from eitbench.numerics.mesh import graded_pipe_mesh
         from eitbench.physics.cem import CompleteElectrodeModel
-        at_electrodes, across = (10, 28) if fine else (5, 14)
+        factor = 2 * self.truth_refinement if fine else 1
+        at_electrodes, across = 5 * factor, 14 * factor
         straight = graded_pipe_mesh(self.length, self.half_width, self.electrode_spans,
                                     at_electrodes, across)
         return CompleteElectrodeModel(self.deform(straight), self.electrodes(straight),

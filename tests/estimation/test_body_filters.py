@@ -9,7 +9,7 @@ from eitbench.bench.methods import builtin_methods, load_method
 from eitbench.data.episode_cache import cached_episode, cycle_voltages
 from eitbench.data.episodes import cached_truth_model
 from eitbench.envs.injection_core import InjectionCore
-from eitbench.estimation.body_particles import SIGNAL_ERROR, BodyParticleFilter, BodyTracker, body_model
+from eitbench.estimation.body_particles import BodyParticleFilter, BodyTracker, body_model
 from eitbench.estimation.onboard.belief import BodyBelief
 from eitbench.estimation.onboard.rules import Rules
 from eitbench.worlds import entry
@@ -75,7 +75,7 @@ def test_weights_are_those_of_bayes_formula():
     for p in range(filters.n_particles):
         change = (model.signals[:, index[p]] @ weights[p]).reshape(16, 16)
         signal = amplitude * (change[:, i] - change[:, j])[measured]
-        variance = std**2 + (SIGNAL_ERROR * signal)**2
+        variance = std**2 + (model.motion.signal_error * signal)**2
         residual = core._voltages[0, measured] - base[measured] - signal
         residuals.append(residual)
         variances.append(variance)
@@ -107,7 +107,7 @@ def test_criteria_are_those_of_a_gaussian_of_images_and_voltages():
         measured = rules.instrument.measurement_mask(current)
         voltages = (changes @ current)[:, measured]
         std = model.noise_std(model.resistance @ current)[measured]
-        R = np.diag(std**2 + SIGNAL_ERROR**2 * (w @ voltages**2))
+        R = np.diag(std**2 + model.motion.signal_error**2 * (w @ voltages**2))
         joint = np.cov(np.hstack([images, voltages]).T, aweights=w, bias=True)
         m = images.shape[1]
         S = joint[m:, m:] + R

@@ -10,11 +10,10 @@ import numpy as np
 import scipy.sparse as sp
 
 from eitbench.data.episode_cache import scoring_constants
-from eitbench.estimation.body_particles import SIGNAL_ERROR, measured_first
+from eitbench.estimation.body_particles import measured_first
 from eitbench.estimation.onboard.body_filters import BodyFilters
 from eitbench.estimation.onboard.linearisation import linearisation_table
 from eitbench.estimation.onboard.reduced_filters import ReducedFilters
-from eitbench.worlds.bodies import reflect
 
 if TYPE_CHECKING:
     from eitbench.estimation.onboard.linearisation import Linearisation
@@ -369,7 +368,7 @@ class BodyBelief:
         particles = model.move(self._filters.filter.particles, np.random.default_rng(1))
         if centre is not None:
             moved = particles.centres + centre - weights @ particles.centres[0]
-            particles = particles._replace(centres=reflect(moved, moved, model.limit)[0],
+            particles = particles._replace(centres=model.motion.within(moved),
                                            present=np.ones_like(particles.present))
         index, shares = model.cells(particles)
         cells = sp.csr_array((shares.ravel(), index.ravel(), np.arange(0, index.size + 1, 4)),
@@ -383,4 +382,4 @@ class BodyBelief:
         square = variance[i] + variance[j] - 2.0 * covariance[i, j] + (mean[i] - mean[j])**2
         cross = covariance[:, -self._filters.patches.shape[0]:]
         return pair_design_criteria(covariance, cross @ cross.T, self._entries,
-                                    self._variance + SIGNAL_ERROR**2 * square)
+                                    self._variance + model.motion.signal_error**2 * square)

@@ -10,7 +10,7 @@ from gymnasium import spaces
 
 from eitbench import _check
 from eitbench.estimation.onboard.linearisation import electrode_pairs, pair_currents
-from eitbench.worlds.bodies import WanderingBody
+from eitbench.worlds.bodies import MovingBody
 
 if TYPE_CHECKING:
     from eitbench.worlds.instrument import Instrument
@@ -70,7 +70,7 @@ class Rules:
     @property
     def tracks_body(self) -> bool:
         """True if the filter inside estimates the position of a body, not a concentration."""
-        return isinstance(self.world.target, WanderingBody)
+        return isinstance(self.world.target, MovingBody)
 
     @property
     def pairs(self) -> np.ndarray:

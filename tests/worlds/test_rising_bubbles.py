@@ -1,0 +1,168 @@
+"""Bubbles that rise through a pipe: their paths, the filter's motion, and tracking with one pair after another."""
+
+from functools import lru_cache
+
+import numpy as np
+import pytest
+from eitbench.data.episodes import cached_truth_model
+from eitbench.envs.injection_core import InjectionCore
+from eitbench.estimation.body_particles import BodyParticleFilter, body_model
+from eitbench.estimation.onboard.belief import BodyBelief
+from eitbench.estimation.onboard.rules import Rules
+from eitbench.worlds.bodies import TRANSITION_WIDTH, RisingBubble, disc_indicator
+from eitbench.worlds.flows import LaminarFlow, NoFlow
+from eitbench.worlds.instrument import Instrument
+from eitbench.worlds.random_streams import episode_streams
+from eitbench.worlds.schedule import Schedule
+from eitbench.worlds.task import make_task
+from eitbench.worlds.vessels import Bulge, PlanePipe, RoundTank
+from eitbench.worlds.world import Prior, World
+
+from tiny_worlds import truths
+
+BUBBLES = World(
+    "Bubbles", PlanePipe(), LaminarFlow(mean_velocity=0.3), RisingBubble(),
+    Instrument(noise_relative=3e-3, noise_relative_to_max=3e-4, readings="neighbours"),
+    Schedule(time_step=0.025, scored_steps=24, warm_up=8), Prior(expected_concentration=30.0))
+LENGTH, R, DT = BUBBLES.vessel.length, BUBBLES.vessel.half_width, BUBBLES.time_step
+
+
+@lru_cache(maxsize=1)
+def paths():
+    long = BUBBLES.with_changes({"schedule": {"scored_steps": 2000}})
+    return [long.target.path(long, episode_streams(seed).flow) for seed in range(20)]
+
+
+def visits(path):
+    """Yield the steps of each bubble that entered and left in the episode."""
+    steps = np.flatnonzero(path.present)
+    yield from np.split(steps, np.flatnonzero(np.diff(steps) > 1) + 1)[1:-1]
+
+
+def test_bubbles_cross_the_pipe_faster_than_the_flow():
+    """Each enters at the inlet, leaves at the outlet, and has the speed of the flow plus a constant slip."""
+    slips = []
+    for path in paths():
+        assert 0.008 <= path.radius <= 0.012
+        for steps in visits(path):
+            x, y = path.centres[steps].T
+            assert x[0] == path.radius and x[-1] < LENGTH - path.radius <= x[-1] + 0.95 * DT
+            assert np.abs(y).max() <= R - path.radius
+            slip = np.diff(x) / DT - 0.45 * (1.0 - (y[:-1] / R)**2)
+            np.testing.assert_allclose(slip, slip[0], rtol=1e-9)
+            slips.append(slip[0])
+    assert min(slips) > 0.05 and max(slips) < 0.5 and len(slips) > 500
+    assert np.mean(slips) == pytest.approx(0.275, abs=0.025)
+
+
+def test_bubbles_oscillate_and_wait():
+    """The height follows y'' = −ω² (y − y₀), and the waits have their mean."""
+    waits = []
+    for path in paths():
+        changes = np.flatnonzero(np.diff(path.present.astype(int)))
+        gaps = np.diff(changes)[int(path.present[0] == 0)::2]
+        waits += [DT * gap for gap in gaps]
+        for steps in visits(path):
+            y = path.centres[steps, 1]
+            if np.ptp(y) > 1e-3 and len(y) > 8:
+                curvature, centred = y[2:] - 2.0 * y[1:-1] + y[:-2], y[1:-1] - y[1:-1].mean()
+                slope = (curvature - curvature.mean()) @ centred / (centred @ centred)
+                frequency = np.arccos(1.0 + 0.5 * slope) / (2.0 * np.pi * DT)
+                assert 1.0 - 1e-6 <= frequency <= 3.0 + 1e-6
+    # a wait ends at the next step: half a step longer in the mean
+    assert np.mean(waits) == pytest.approx(0.2 + 0.5 * DT, rel=0.1)
+
+
+def test_truth_is_the_bubble_on_its_path():
+    path = BUBBLES.target.path(BUBBLES, episode_streams(3).flow)
+    points = cached_truth_model(BUBBLES).transport.mesh.points
+    (truth,) = truths(BUBBLES, 3)
+    for t in (0, 10, 20, 30):
+        disc = path.present[t] * disc_indicator(points, path.centres[t], path.radius, TRANSITION_WIDTH)
+        np.testing.assert_allclose(truth.concentration[t], 30.0 - 28.5 * disc, rtol=1e-6)
+
+
+def test_truth_has_a_finer_electrode_mesh_on_request():
+    fine = BUBBLES.with_changes({"vessel": {"truth_refinement": 2}})
+    nodes = [world.vessel.electrode_model(True).mesh.n_nodes for world in (BUBBLES, fine)]
+    assert 3.5 < nodes[1] / nodes[0] < 4.5
+    assert fine.vessel.electrode_model(False).mesh.n_nodes == BUBBLES.vessel.electrode_model(False).mesh.n_nodes
+
+
+@pytest.mark.parametrize(("centre", "limit"), [((0.2, 0.0), 0.06), ((0.1, 0.02), 0.07), ((0.311, -0.03), 0.12)])
+def test_signals_are_those_of_the_complete_electrode_model(centre, limit):
+    model, truth = body_model(make_task(BUBBLES)), cached_truth_model(BUBBLES)
+    points = truth.transport.mesh.points
+    liquid = np.full(len(points), 30.0)
+    disc = disc_indicator(points, np.array(centre), model.radius, TRANSITION_WIDTH)
+    expected = np.subtract(*(truth.observation.transfer_resistance(c) for c in (liquid - 28.5 * disc, liquid)))
+    filters = BodyParticleFilter(model, 1, 1)
+    filters.particles.centres[:] = centre
+    filters.particles.areas[:] = 1.0
+    index, weights = (each[0, 0] for each in model.cells(filters.particles))
+    found = (model.signals[:, index] @ weights).reshape(16, 16)
+    scale = (found * expected).sum() / (found**2).sum()
+    assert np.linalg.norm(scale * found - expected) < limit * np.linalg.norm(expected)
+    assert scale == pytest.approx(1.0, abs=0.15)
+
+
+def test_particles_move_with_the_flow_and_stay_in_the_pipe():
+    """Velocities are relative to the flow; particles leave at the outlet, and absent ones enter at the inlet."""
+    filters = BodyParticleFilter(body_model(make_task(BUBBLES)), 2, 4096)
+    model, random = filters.model, np.random.default_rng(0)
+    before = filters.particles
+    after = model.move(before, random)
+    velocity = (after.centres - before.centres) / DT - after.velocities
+    inside = (np.abs(before.centres[..., 1]) < 0.03) & (before.centres[..., 0] < 0.35) & after.present
+    y = before.centres[..., 1][inside]
+    np.testing.assert_allclose(velocity[..., 0][inside], 0.45 * (1.0 - (y / R)**2), rtol=1e-9)
+    assert after.velocities[..., 0].mean() == pytest.approx(0.275, abs=0.01)
+    shares = []
+    for _ in range(400):
+        before, after = after, model.move(after, random)
+        entered = ~before.present & after.present
+        assert (after.centres[..., 0][entered] < 0.01 + 1.5 * DT).all()
+        assert np.abs(after.centres[..., 1]).max() <= R - 0.01 + 1e-12
+        shares.append(after.present.mean())
+    true = np.mean([path.present.mean() for path in paths()])
+    assert np.mean(shares[100:]) == pytest.approx(true, abs=0.08)
+
+
+def test_filter_follows_bubbles():
+    """Three pairs in turn locate the bubbles that are found."""
+    rules, seeds = Rules(BUBBLES), [0, 1, 2]
+    core = InjectionCore(rules, "reduced")
+    core.reset(seeds)
+    pairs = rules.pairs.tolist()
+    errors = []
+    for k in range(core.length):
+        core.act(np.full(len(seeds), pairs.index(([2, 9], [0, 7], [5, 9])[k % 3])))
+        true = [BUBBLES.target.path(BUBBLES, episode_streams(seed).flow) for seed in seeds]
+        errors += [np.hypot(*(body[:2] - path.centres[core.t])) for body, path in
+                   zip(core.body(), true, strict=True) if path.present[core.t] and body[-1] > 0.5]
+    assert len(errors) > 20 and np.median(errors) < 0.012
+
+
+def test_oracle_centres_the_particles_on_the_bubble():
+    """A pair next to the bubble is the best one when its position is known."""
+    core = InjectionCore(Rules(BUBBLES), "reduced")
+    core.reset([0])
+    belief = BodyBelief(core.rules, {name: array[0] for name, array in core.observe().items()})
+    for x in (0.1, 0.3):
+        best = core.rules.pairs[belief.criteria(np.array([x, 0.0]))[0].argmax()]
+        assert np.abs((best % 8 + 0.5) * LENGTH / 8 - x).min() < 0.06
+
+
+@pytest.mark.parametrize(("changes", "message"), [
+    ({"target": {"radius_range": (0.01, 0.045)}}, "target.radius_range and amplitude_range must have a sum"),
+    ({"target": {"slip_range": (0.3, 0.1)}}, "slip_range must be a range"),
+    ({"target": {"mean_wait": 0.0}}, "mean_wait must be"),
+    ({"vessel": PlanePipe(bulge=Bulge())}, "target must be in a PlanePipe without a bulge"),
+    ({"vessel": RoundTank()}, "target must be in a PlanePipe without a bulge"),
+    ({"flow": NoFlow()}, "flow must be a flow through the pipe")])
+def test_an_invalid_world_is_refused(changes, message):
+    with pytest.raises(ValueError, match=message):
+        World(**{name: getattr(BUBBLES, name) for name in ("name", "vessel", "flow", "target", "instrument", "schedule",
+                                                           "prior")}
+              | {name: part for name, part in changes.items() if not isinstance(part, dict)}
+              ).with_changes({name: part for name, part in changes.items() if isinstance(part, dict)})
