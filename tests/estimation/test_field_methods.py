@@ -133,4 +133,7 @@ def test_images_of_a_frame(method, blur):
     np.testing.assert_allclose(image(method, task, clean), 28.0, rtol=1e-6)
     distance = np.linalg.norm(task.mesh.points - task.mesh.points.mean(axis=0) - [0.05, 0.03], axis=1)
     voltages = task.observation.voltages(28.0 + 6.0 * np.exp(-(distance / 0.02)**2), task.currents)
-    assert distance[np.argmax(image(method, task, voltages))] < blur
+    changed = image(method, task, voltages)
+    assert distance[np.argmax(changed)] < blur
+    if method == "back_projection":    # the coarse electrode mesh does not see 485 nodes
+        assert np.unique(np.round(changed, 9), return_counts=True)[1].max() < 20
