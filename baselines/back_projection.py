@@ -9,16 +9,17 @@ other node.
 """
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from eitbench import Task
-from eitbench.estimation import FrameEstimator
+from eitbench.estimation import FrameEstimator, nearest_observed
 
 
 class Estimator(FrameEstimator):
     subtracks = ("filter", "smoothing")
 
     def __init__(self, task: Task) -> None:
+        nearest = nearest_observed(task)
+
         def reconstruct(V: np.ndarray, I: np.ndarray, start: np.ndarray) -> np.ndarray:
             computed, jacobian = task.observation.linearise(start, I)
             measured = np.isfinite(V)
@@ -27,10 +28,7 @@ class Estimator(FrameEstimator):
             uniform = jacobian[measured].sum(axis=1) / std    # change by a unit change of c
             change = (V - computed)[measured] / std
             total = uniform**2 @ sensitivity
-            seen = np.flatnonzero(total > 1e-9 * total.max())
-            points = task.mesh.points
-            _, nearest = cKDTree(points[seen]).query(points)
-            image = (uniform * change) @ sensitivity[:, seen] / total[seen]
-            return start + image[nearest]
+            image = (uniform * change) @ sensitivity / np.where(total > 0.0, total, 1.0)
+            return (start + image)[nearest]
 
         super().__init__(task, reconstruct)

@@ -15,7 +15,13 @@ from threadpoolctl import threadpool_limits
 from eitbench import Task, make_task, simulate
 from eitbench.data.episode_cache import score_operators
 from eitbench.data.seeds import parse_seeds
-from eitbench.estimation import best_homogeneous, gauss_newton, one_step, total_variation
+from eitbench.estimation import (
+    best_homogeneous,
+    gauss_newton,
+    nearest_observed,
+    one_step,
+    total_variation,
+)
 from eitbench.numerics.fem import stiffness_matrix
 from eitbench.scoring import relative_error
 from eitbench.worlds.catalogue import PIPE_2D
@@ -27,6 +33,7 @@ SEEDS, STATES = "train:0-3", (30, 60, 90)
 def candidates(task: Task) -> dict[str, Callable[..., np.ndarray]]:
     """Return the reconstructions of the grids: name -> function of voltages, std and ĉ_bh (n,)."""
     stiffness = stiffness_matrix(task.mesh)
+    nearest = nearest_observed(task)
     found: dict[str, Callable[..., np.ndarray]] = {"homogeneous": lambda V, std, start: start}
     for alpha in 2.0 ** np.arange(-5, 2.5, 0.5):
         found[f"gauss_newton ALPHA = {alpha:.4f}"] = partial(
@@ -35,7 +42,8 @@ def candidates(task: Task) -> dict[str, Callable[..., np.ndarray]]:
     for strength, power in product(2.0 ** np.arange(-8, 4), (0.0, 0.5, 1.0)):
         found[f"noser STRENGTH = {strength:g}, POWER = {power:g}"] = partial(
             lambda strength, power, V, std, start: one_step(
-                task.observation, V, task.currents, std, strength, power, start), strength, power)
+                task.observation, V, task.currents, std, strength, power, start)[nearest],
+            strength, power)
     for alpha in 2.0 ** np.arange(-1, 6):
         found[f"total_variation ALPHA = {alpha:g}"] = partial(
             lambda alpha, V, std, start: total_variation(

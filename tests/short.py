@@ -47,6 +47,8 @@ SHORT = {
     "TankTracking": {"schedule": {"scored_steps": 4}},
     "WanderingBody2D": TANK,
     "SearchAndTrack": {"schedule": {"scored_steps": 4}},
+    "BubbleTracking": {"schedule": {"warm_up": 1, "scored_steps": 4}},
+    "RisingBubbles2D": {"schedule": {"warm_up": 1, "scored_steps": 4}},
     "TankInjection": {"schedule": {"warm_up": 2, "scored_steps": 3}},
 }
 """Name of a world -> overrides for short episodes. Worlds of the track injection keep vessel and flow, for which the
@@ -57,7 +59,7 @@ def world(name: str) -> dict:
     """Return keyword arguments for short episodes of an id."""
     each = entry(name)
     kind = each.world.name
-    if each.track == "injection" and kind not in ("TankTracking", "SearchAndTrack"):
+    if each.track == "injection" and kind not in ("TankTracking", "SearchAndTrack", "BubbleTracking"):
         kind = "TankInjection" if kind == "RotatingTank2D" else "PipeInjection"
     assert kind in SHORT, f"{name} has no short version yet: give {kind!r} one in tests/short.py"
     return {"world": SHORT[kind]}

@@ -29,6 +29,7 @@ from eitbench.estimation.gauss_newton import (
     StationaryMap,
     best_homogeneous,
     gauss_newton,
+    nearest_observed,
     one_step,
     total_variation,
 )
@@ -105,8 +106,8 @@ __all__ = [
     "gauss_newton", "gru_step", "identify_model", "inflow_filter", "initial_covariance",
     "initial_hidden_state", "innovate", "kalman_filter", "linearise_at_prediction",
     "linearise_at_reference", "linearise_voltages", "load_network", "map_inflow",
-    "maximise_posterior", "modal_states", "network_matches_task", "nodal_filter",
-    "nodal_states", "one_step", "reduced_response", "scaled_velocity_prior", "smooth_means",
-    "smooth_state", "smoothness_covariance", "steady_response", "task_velocity_prior",
-    "time_varying_responses", "total_variation",
+    "maximise_posterior", "modal_states", "nearest_observed", "network_matches_task",
+    "nodal_filter", "nodal_states", "one_step", "reduced_response", "scaled_velocity_prior",
+    "smooth_means", "smooth_state", "smoothness_covariance", "steady_response",
+    "task_velocity_prior", "time_varying_responses", "total_variation",
 ]

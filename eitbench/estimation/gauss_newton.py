@@ -100,6 +100,16 @@ def one_step(model: VoltageModel, voltages: np.ndarray, currents: np.ndarray,
     return start + solution
 
 
+def nearest_observed(task: Task) -> np.ndarray:
+    """Return the nearest node of each node, (n,), on which voltages depend: the electrode mesh may
+    have no node near a node of the transport mesh."""
+    # lazy import: other estimators do not need it
+    from scipy.spatial import cKDTree
+    weights = abs(task.observation.interpolation).max(axis=0).toarray().ravel()
+    observed = np.flatnonzero(weights > 1e-9)    # less is rounding
+    return observed[cKDTree(task.mesh.points[observed]).query(task.mesh.points)[1]]
+
+
 def total_variation(model: VoltageModel, voltages: np.ndarray, currents: np.ndarray,
                     noise_std: np.ndarray, mesh: Mesh, alpha: float, smoothing: float,
                     start: np.ndarray, n_iterations: int = 10) -> np.ndarray:

@@ -10,7 +10,7 @@ from pathlib import Path
 from string import Template
 from typing import Any
 
-from eitbench.worlds.bodies import Cylinders, ResistiveDisc, WanderingBody
+from eitbench.worlds.bodies import Cylinders, ResistiveDisc, RisingBubble, WanderingBody
 from eitbench.worlds.flows import (
     FlowPastBulge,
     LaminarFlow,
@@ -201,3 +201,14 @@ add_example(replace(TANK_TRACKING, name="WanderingBody2D",
 add_injection(TANK_TRACKING, test_seeds="test:0-49", is_starting_point=True)
 add_injection(replace(TANK_TRACKING, name="SearchAndTrack", target=WanderingBody(visit_time=1.0)),
               test_seeds="test:0-49")
+
+# -- Bubbles in a vertical pipe --
+
+BUBBLE_TRACKING = World(
+    "BubbleTracking", PlanePipe(truth_refinement=2), LaminarFlow(mean_velocity=0.3),
+    RisingBubble(), TANK_TRACKING.instrument,
+    Schedule(time_step=0.025, scored_steps=96, warm_up=16), Prior(expected_concentration=30.0))
+"""A bubble passes an electrode in three time steps. All numbers [E]."""
+add_extension(replace(BUBBLE_TRACKING, name="RisingBubbles2D",
+                      instrument=replace(BUBBLE_TRACKING.instrument, readings="all")))
+add_injection(BUBBLE_TRACKING, test_seeds="test:0-49")

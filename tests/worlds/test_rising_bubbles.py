@@ -9,21 +9,18 @@ from eitbench.envs.injection_core import InjectionCore
 from eitbench.estimation.body_particles import BodyParticleFilter, body_model
 from eitbench.estimation.onboard.belief import BodyBelief
 from eitbench.estimation.onboard.rules import Rules
-from eitbench.worlds.bodies import TRANSITION_WIDTH, RisingBubble, disc_indicator
-from eitbench.worlds.flows import LaminarFlow, NoFlow
-from eitbench.worlds.instrument import Instrument
+from eitbench.worlds.bodies import TRANSITION_WIDTH, disc_indicator
+from eitbench.worlds.flows import NoFlow
 from eitbench.worlds.random_streams import episode_streams
-from eitbench.worlds.schedule import Schedule
+from eitbench.worlds.registry import entry
 from eitbench.worlds.task import make_task
 from eitbench.worlds.vessels import Bulge, PlanePipe, RoundTank
-from eitbench.worlds.world import Prior, World
+from eitbench.worlds.world import World
 
 from tiny_worlds import truths
 
-BUBBLES = World(
-    "Bubbles", PlanePipe(), LaminarFlow(mean_velocity=0.3), RisingBubble(),
-    Instrument(noise_relative=3e-3, noise_relative_to_max=3e-4, readings="neighbours"),
-    Schedule(time_step=0.025, scored_steps=24, warm_up=8), Prior(expected_concentration=30.0))
+BUBBLES = entry("eitbench/BubbleTracking-v0").world.with_changes(
+    {"vessel": {"truth_refinement": 1}, "schedule": {"scored_steps": 24, "warm_up": 8}})
 LENGTH, R, DT = BUBBLES.vessel.length, BUBBLES.vessel.half_width, BUBBLES.time_step
 
 
