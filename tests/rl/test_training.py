@@ -12,6 +12,7 @@ from eitbench.envs.injection import InjectionVectorEnv
 from eitbench.estimation.onboard.rules import Rules
 from eitbench.rl import training
 from eitbench.rl.agents import configuration_hash, load_agent
+from eitbench.rl.networks import MaskablePairPolicy, PairPolicy, most_probable
 from eitbench.rl.training import ALGORITHMS, TrainingConfig, read_config, train
 from eitbench.rl.vec_env import InjectionVecEnv
 from eitbench.worlds.catalogue import PIPE_2D
@@ -266,3 +267,16 @@ def test_the_command_prints_the_score_and_the_next_command(monkeypatch, tmp_path
     errors = np.load(tmp_path / "run" / "evaluations.npz")["errors"][-1]
     assert f"ẽ_c {errors.mean():.3g}, return " in said and " in 2 dev episodes" in said
     assert f"next: eitbench run --env {NAME} --policy {tmp_path / 'run' / 'model.zip'}" in said
+
+
+@pytest.mark.parametrize(("algorithm", "policy"), [("ppo", PairPolicy), ("maskable_ppo", MaskablePairPolicy)])
+def test_an_agent_chooses_the_most_probable_pair(algorithm, policy):
+    """The action is that of `predict`, for random observations and masks."""
+    model = ALGORITHMS[algorithm](policy, gym.make(NAME, **SHORT), seed=4)
+    rng = np.random.default_rng(0)
+    actions = []
+    for observation in rng.normal(size=(50, *model.observation_space.shape)).astype(np.float32):
+        masks = {"action_masks": rng.uniform(size=120) < 0.5} if algorithm == "maskable_ppo" else {}
+        actions.append(most_probable(model.policy, observation, **masks))
+        assert actions[-1] == model.predict(observation, deterministic=True, **masks)[0]
+    assert len(set(actions)) > 5
