@@ -208,7 +208,9 @@ BUBBLE_TRACKING = World(
     "BubbleTracking", PlanePipe(truth_refinement=2), LaminarFlow(mean_velocity=0.3),
     RisingBubble(), TANK_TRACKING.instrument,
     Schedule(time_step=0.025, scored_steps=96, warm_up=16), Prior(expected_concentration=30.0))
-"""A bubble passes an electrode in three time steps. All numbers [E]."""
+"""The mesh of the truth changes voltages by 0.2 standard deviations of the noise (median of the
+pairs), of a bubble at the wall by up to 2.2 (``tests/worlds/test_wandering_body.py``). All numbers
+[E]."""
 add_extension(replace(BUBBLE_TRACKING, name="RisingBubbles2D",
                       instrument=replace(BUBBLE_TRACKING.instrument, readings="all")))
 add_injection(BUBBLE_TRACKING, test_seeds="test:0-49")
