@@ -70,8 +70,8 @@ def _with_pairs(policy: Any, lr_schedule: Schedule) -> None:
 
 def most_probable(policy: PairPolicy | MaskablePairPolicy, observation: np.ndarray,
                   action_masks: np.ndarray | None = None) -> int:
-    """Return the deterministic action for an observation (d,) float32, among those of
-    ``action_masks`` (n,) bool. It takes a third of the time of `predict`."""
+    """Return the deterministic action for an observation (d,) float32, in a third of the time of
+    `predict`; ``action_masks`` (n,) bool marks the allowed actions."""
     with torch.no_grad():
         latent = policy.mlp_extractor.forward_actor(torch.as_tensor(observation)[None])
         logits = policy.action_net(latent)[0].numpy()

@@ -271,7 +271,7 @@ def test_the_command_prints_the_score_and_the_next_command(monkeypatch, tmp_path
 
 @pytest.mark.parametrize(("algorithm", "policy"), [("ppo", PairPolicy), ("maskable_ppo", MaskablePairPolicy)])
 def test_an_agent_chooses_the_most_probable_pair(algorithm, policy):
-    """The action is that of `predict`, for random observations and masks."""
+    """`predict` returns the same action, for random observations and masks."""
     model = ALGORITHMS[algorithm](policy, gym.make(NAME, **SHORT), seed=4)
     rng = np.random.default_rng(0)
     actions = []
