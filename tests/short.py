@@ -47,7 +47,7 @@ SHORT = {
     "TankTracking": {"schedule": {"scored_steps": 4}},
     "WanderingBody2D": TANK,
     "SearchAndTrack": {"schedule": {"scored_steps": 4}},
-    "BubbleTracking": {"schedule": {"warm_up": 1, "scored_steps": 4}},
+    "BubbleTracking": {"schedule": {"scored_steps": 4}},
     "RisingBubbles2D": {"schedule": {"warm_up": 1, "scored_steps": 4}},
     "TankInjection": {"schedule": {"warm_up": 2, "scored_steps": 3}},
 }

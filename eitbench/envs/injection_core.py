@@ -80,6 +80,10 @@ class InjectionCore(EpisodeCore):
         else:
             self.max_batch = np.inf
         self.length = self.world.n_steps - self.n_initial
+        if self.length < 1:
+            raise ValueError("world.schedule must have more time steps than the cycle of "
+                             f"{self.n_initial} injections before the agent's first, got "
+                             f"{self.world.n_steps}")
         self.action_space = rules.action_space
 
     @property

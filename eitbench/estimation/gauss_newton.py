@@ -101,8 +101,8 @@ def one_step(model: VoltageModel, voltages: np.ndarray, currents: np.ndarray,
 
 
 def nearest_observed(task: Task) -> np.ndarray:
-    """Return the nearest node of each node, (n,), on which voltages depend: the electrode mesh may
-    have no node near a node of the transport mesh."""
+    """Return for each node the number of the nearest node on which voltages depend, (n,). They do
+    not depend on all nodes if the electrode mesh is coarser than the transport mesh."""
     # lazy import: other estimators do not need it
     from scipy.spatial import cKDTree
     weights = abs(task.observation.interpolation).max(axis=0).toarray().ravel()

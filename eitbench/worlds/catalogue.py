@@ -207,7 +207,7 @@ add_injection(replace(TANK_TRACKING, name="SearchAndTrack", target=WanderingBody
 BUBBLE_TRACKING = World(
     "BubbleTracking", PlanePipe(truth_refinement=2), LaminarFlow(mean_velocity=0.3),
     RisingBubble(), TANK_TRACKING.instrument,
-    Schedule(time_step=0.025, scored_steps=96, warm_up=16), Prior(expected_concentration=30.0))
+    Schedule(time_step=0.025, scored_steps=92, warm_up=20), Prior(expected_concentration=30.0))
 """The mesh of the truth changes voltages by 0.2 standard deviations of the noise (median of the
 pairs), of a bubble at the wall by up to 2.2 (``tests/worlds/test_wandering_body.py``). All numbers
 [E]."""
