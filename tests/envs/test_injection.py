@@ -186,3 +186,8 @@ def test_wrong_actions_are_named():
         many.step(np.zeros(2))
     with pytest.raises(ValueError, match=r"actions must lie in \[0, 119\], got 0 … 120"):
         many.step(np.array([0, 120]))
+
+
+def test_episodes_are_longer_than_the_first_frame():
+    with pytest.raises(ValueError, match=r"world.schedule must have more time steps than the cycle of 16 .* got 5"):
+        gym.make(FAULTS, world={"schedule": {"warm_up": 1, "scored_steps": 4}})
