@@ -31,7 +31,7 @@ def table_path(folder: Path) -> Path:
 def write_episode_table(records: Iterable[dict[str, Any]], path: Path) -> None:
     """Write the episodes of records as compressed CSV, atomically; for one version of liblzma the
     bytes depend on the records only."""
-    content = lzma.compress(episode_table(records).encode(), preset=9)
+    content = lzma.compress(episode_table(records).encode(), preset=9 | lzma.PRESET_EXTREME)
     write_atomically(path, content)
 
 
