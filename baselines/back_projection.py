@@ -4,7 +4,7 @@ of a frame (Barber & Brown 1984; Xie et al. 1992).
 The change of a voltage is relative to its change by a uniform concentration, so that a uniform
 change is reproduced. The weight is the sensitivity of the voltage to the node, multiplied by the
 precision of the relative change. The image is qualitative: it is blurred over the vessel. Nodes
-which the electrode model does not see, because its mesh is coarser, get the value of the nearest
+on which no voltage depends, because the electrode mesh is coarser, get the value of the nearest
 other node.
 """
 
@@ -24,11 +24,9 @@ class Estimator(FrameEstimator):
             computed, jacobian = task.observation.linearise(start, I)
             measured = np.isfinite(V)
             std = task.noise.std(computed)[measured]
-            sensitivity = np.abs(jacobian[measured]) / std[:, None]
+            sensitivity = np.abs(jacobian[measured])[:, nearest] / std[:, None]
             uniform = jacobian[measured].sum(axis=1) / std    # change by a unit change of c
             change = (V - computed)[measured] / std
-            total = uniform**2 @ sensitivity
-            image = (uniform * change) @ sensitivity / np.where(total > 0.0, total, 1.0)
-            return (start + image)[nearest]
+            return start + (uniform * change) @ sensitivity / (uniform**2 @ sensitivity)
 
         super().__init__(task, reconstruct)

@@ -1,6 +1,6 @@
 """One-step difference image with NOSER prior: one Newton step from the homogeneous estimate of each
-frame, under the assumption of a stationary target (Cheney et al. 1990). Nodes which the electrode
-model does not see get the value of the nearest other node.
+frame, under the assumption of a stationary target (Cheney et al. 1990). Nodes on which no
+voltage depends get the value of the nearest other node.
 
 STRENGTH and POWER (`one_step`) were chosen as ALPHA of `gauss_newton`, by
 `studies/tune_reconstruction.py`.

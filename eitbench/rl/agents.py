@@ -68,7 +68,6 @@ class _ModelPolicy(AgentPolicy):
 
     model: ClassVar[Any]
     uses_action_masks: ClassVar[bool]
-    has_pair_logits: ClassVar[bool]
 
     @classmethod
     def suits(cls, rules: Rules) -> bool:
@@ -84,9 +83,9 @@ class _ModelPolicy(AgentPolicy):
 
     def choose(self, observation: np.ndarray, mask: np.ndarray) -> Any:
         # lazy import: other policies do not need torch
-        from eitbench.rl.networks import most_probable
+        from eitbench.rl.networks import MaskablePairPolicy, PairPolicy, most_probable
         masks = {"action_masks": mask} if self.uses_action_masks else {}
-        if self.has_pair_logits:
+        if isinstance(self.model.policy, PairPolicy | MaskablePairPolicy):
             return most_probable(self.model.policy, observation, **masks)
         action, self._hidden_state = self.model.predict(
             observation, state=self._hidden_state, episode_start=np.array([self._is_first]),
@@ -172,7 +171,6 @@ def load_agent(path: Path, content: bytes) -> tuple[str, str, type[AgentPolicy],
     if found != expected:
         raise ValueError(f"policy {path} must have the sha256 of its folder, {expected}, got "
                          f"{found}")
-    from eitbench.rl.networks import MaskablePairPolicy, PairPolicy
     from eitbench.rl.training import ALGORITHMS
     algo, seed = asked["algo"], asked["seed"]
     try:
@@ -181,7 +179,6 @@ def load_agent(path: Path, content: bytes) -> tuple[str, str, type[AgentPolicy],
         raise ValueError(f"policy {path} must be a model of the algorithm {algo}") from error
     policy = type("Policy", (_ModelPolicy,), {
         "model": model, "uses_action_masks": algo.startswith("maskable"),
-        "has_pair_logits": isinstance(model.policy, PairPolicy | MaskablePairPolicy),
         "estimator": asked.get("kwargs", {}).get("estimator", "reduced")})
     built_in = (baseline_folder() / "checkpoints" / asked["env"].replace("/", "-") / algo
                 / f"seed{seed}" / "sha256")             # a copy of it is built-in too

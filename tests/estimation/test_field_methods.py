@@ -135,5 +135,5 @@ def test_images_of_a_frame(method, blur):
     voltages = task.observation.voltages(28.0 + 6.0 * np.exp(-(distance / 0.02)**2), task.currents)
     changed = image(method, task, voltages)
     assert distance[np.argmax(changed)] < blur
-    if method in ("back_projection", "noser"):    # the coarse electrode mesh does not see 485 nodes
+    if method in ("back_projection", "noser"):    # no voltage depends on 485 nodes
         assert np.unique(np.round(changed, 9), return_counts=True)[1].max() < 20
