@@ -27,12 +27,12 @@ def table(text: str, column: int = 1) -> dict[str, str]:
 
 
 def test_sections_and_sizes(described):
-    """The page begins with the world's description; sizes equal the spaces and the episode's length."""
+    """The page begins with the description, without placeholders; sizes equal the spaces and the episode's length."""
     id, text, env = described
     assert re.findall(r"^## (.*)$", text, re.MULTILINE) == [
         "Description", "Action Space", "Observation Space", "Rewards", "Starting State", "Episode End",
         "Arguments", *["Returns"] * (entries()[id].track == "injection"), "World"]
-    assert section(text, "Description").startswith(entries()[id].description.strip())
+    assert section(text, "Description").startswith(entries()[id].description.strip()) and "$" not in text
     sizes = table(section(text, "Description"))
     world = env.world
     assert str(env.action_space.shape) in sizes["action space"] or f"({env.action_space.n})" in sizes["action space"]
