@@ -23,6 +23,9 @@ POSITION_JITTER = 1e-3
 """m, standard deviation of the movement of a resampled particle."""
 AREA_WALK = 0.02
 """Standard deviation per step of the logarithm of a particle's area."""
+PROPOSED_ENTRIES = 0.5
+"""Fraction of the absent particles that enter in a time step. Weights correct for the true rate,
+with which few particles would find a body that has just entered."""
 PARTICLES = 2048
 SEED = 0
 
@@ -99,8 +102,10 @@ class BodyModel:
         return (motion.mean_velocity + motion.velocity_std * random.standard_normal((count, 2)),
                 np.exp(self.log_area_std * random.standard_normal(count)))
 
-    def move(self, particles: Particles, random: np.random.Generator) -> Particles:
-        """Move particles by a time step, with the same random numbers in all episodes."""
+    def move(self, particles: Particles, weights: np.ndarray,
+             random: np.random.Generator) -> tuple[Particles, np.ndarray]:
+        """Move particles with their weights (B, P) by a time step, with the same random numbers in
+        all episodes; return them and their weights, which depend on entries only."""
         centres, velocities, areas, present = particles
         motion = self.motion
         B, P = areas.shape
@@ -111,13 +116,17 @@ class BodyModel:
         centres, velocities = motion.move(centres, velocities)
         if motion.has_visits:
             draw = np.asarray(random.uniform(size=P))
-            entering = ~present & (draw < motion.enter)
+            entering = ~present & (draw < PROPOSED_ENTRIES)
+            ratio = np.where(entering, motion.enter / PROPOSED_ENTRIES,
+                             (1.0 - motion.enter) / (1.0 - PROPOSED_ENTRIES))
+            weights = np.where(present, weights, ratio * weights)
+            weights = weights / weights.sum(axis=1, keepdims=True)
             new = motion.entries(random, P), *self._draw_rest(random, P)
             centres, velocities, areas = (
                 np.where(entering.reshape(B, P, *(1,) * (old.ndim - 2)), each, old)
                 for old, each in zip((centres, velocities, areas), new, strict=True))
             present = np.where(present, ~motion.leaves(centres, draw), entering)
-        return Particles(centres, velocities, areas, present)
+        return Particles(centres, velocities, areas, present), weights
 
     def cells(self, particles: Particles) -> tuple[np.ndarray, np.ndarray]:
         """Return the grid points (B, P, 4) around each particle, and their bilinear weights, times
@@ -138,7 +147,8 @@ class BodyModel:
 
 
 class BodyParticleFilter:
-    """Particle filters of B episodes: bootstrap proposals, systematic resampling.
+    """Particle filters of B episodes: proposals from the motion with more entries, systematic
+    resampling.
 
     The concentration of the liquid is known. Random numbers are the same in all episodes.
 
@@ -173,7 +183,7 @@ class BodyParticleFilter:
         """Predict and condition on voltages (B, L) in V for currents (B, L), where ``measured``
         (B, L); return the innovations (B, L) in predicted standard deviations."""
         model = self.model
-        self.particles = model.move(self.particles, self._random)
+        self.particles, self.weights = model.move(self.particles, self.weights, self._random)
         electrodes, used = measured_first(measured & currents.any(axis=1, keepdims=True))
         base = (currents[:, None] @ model.resistance)[:, 0]     # one product per episode
         std, residual = (np.take_along_axis(each, electrodes, axis=1)

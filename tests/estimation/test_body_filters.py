@@ -95,9 +95,8 @@ def test_criteria_are_those_of_a_gaussian_of_images_and_voltages():
     filters, rules = belief._filters.filter, belief.rules
     model = filters.model
     gains, information = belief.criteria()
-    particles = model.move(filters.particles, np.random.default_rng(1))
+    particles, (w,) = model.move(filters.particles, filters.weights, np.random.default_rng(1))
     index, share = (each[0] for each in model.cells(particles))
-    w = filters.weights[0]
     images = np.array([belief._filters.patches[:, index[p]] @ share[p] for p in range(len(w))])
     changes = np.array([model.signals[:, index[p]] @ share[p] for p in range(len(w))]).reshape(-1, 16, 16)
     for pair in (0, 7, 57, 119):
@@ -128,6 +127,21 @@ def test_body_has_the_moments_of_the_particles_that_are_present():
     expected = [*np.average(centres, axis=0, weights=w), *np.average(velocities, axis=0, weights=w), *std,
                 S[0, 1] / std.prod(), np.average(areas, weights=w), w.sum()]
     np.testing.assert_allclose(core.observe()["body"][0], expected, rtol=1e-9)
+
+
+def test_presence_without_measurements_is_that_of_the_markov_chain():
+    """More particles enter than bodies; weights correct for it."""
+    filters = BodyParticleFilter(body_model(make_task(rules_of("eitbench/SearchAndTrack-v0").world)), 1, 8192)
+    leave, enter = -np.expm1(-0.025 / np.array([1.0, 0.5]))
+    expected, found, entries = [1.0], [1.0], []
+    for _ in range(60):
+        absent = ~filters.particles.present
+        filters.assimilate(*np.zeros((2, 1, 16)), np.zeros((1, 16), dtype=bool))
+        entries.append((absent & filters.particles.present).sum() / max(absent.sum(), 1))
+        expected.append(expected[-1] * (1.0 - leave) + (1.0 - expected[-1]) * enter)
+        found.append(filters.body()[0, -1])
+    np.testing.assert_allclose(found, expected, atol=0.04)
+    assert np.max(entries) > 5.0 * enter
 
 
 @pytest.mark.parametrize("id", [ID, "eitbench/SearchAndTrack-v0"])

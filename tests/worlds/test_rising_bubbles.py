@@ -108,7 +108,7 @@ def test_particles_move_with_the_flow_and_stay_in_the_pipe():
     filters = BodyParticleFilter(body_model(make_task(BUBBLES)), 2, 4096)
     model, random = filters.model, np.random.default_rng(0)
     before = filters.particles
-    after = model.move(before, random)
+    after, _ = model.move(before, filters.weights, random)
     velocity = (after.centres - before.centres) / DT - after.velocities
     inside = (np.abs(before.centres[..., 1]) < 0.03) & (before.centres[..., 0] < 0.35) & after.present
     y = before.centres[..., 1][inside]
@@ -116,11 +116,13 @@ def test_particles_move_with_the_flow_and_stay_in_the_pipe():
     assert after.velocities[..., 0].mean() == pytest.approx(0.275, abs=0.01)
     shares = []
     for _ in range(400):
-        before, after = after, model.move(after, random)
-        entered = ~before.present & after.present
-        assert (after.centres[..., 0][entered] < 0.01 + 1.5 * DT).all()
-        assert np.abs(after.centres[..., 1]).max() <= R - 0.01 + 1e-12
-        shares.append(after.present.mean())
+        filters.assimilate(*np.zeros((2, 2, 16)), np.zeros((2, 16), dtype=bool))
+        after = filters.particles
+        shares.append(filters.body()[:, -1].mean())
+        moved = model.move(after, filters.weights, random)[0]
+        entered = ~after.present & moved.present
+        assert (moved.centres[..., 0][entered] < 0.01 + 1.5 * DT).all()
+        assert np.abs(moved.centres[..., 1]).max() <= R - 0.01 + 1e-12
     true = np.mean([path.present.mean() for path in paths()])
     assert np.mean(shares[100:]) == pytest.approx(true, abs=0.08)
 

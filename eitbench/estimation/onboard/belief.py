@@ -363,9 +363,10 @@ class BodyBelief:
         present body, to which the mean of the predicted particles is moved.
         """
         model = self._filters.filter.model
-        weights = self._filters.filter.weights[0]
+        filters = self._filters.filter
         # the random numbers of the filter's next step are not known
-        particles = model.move(self._filters.filter.particles, np.random.default_rng(1))
+        particles, (weights,) = model.move(filters.particles, filters.weights,
+                                           np.random.default_rng(1))
         if centre is not None:
             moved = particles.centres + centre - weights @ particles.centres[0]
             particles = particles._replace(centres=model.motion.within(moved),
