@@ -239,6 +239,19 @@ class InjectionCore(EpisodeCore):
                                                 self._squares[:, k])
         return self._errors
 
+    def trial_errors(self, actions: np.ndarray) -> np.ndarray:
+        """Return the relative errors (A,) of the first episode's estimate after each of these
+        actions (A,), measured without noise. The episode does not advance. For oracles, in
+        environments with a body."""
+        k = self.t
+        self.load_until(k + 1)
+        currents = self.rules.currents(actions)
+        filters: Any = self._filters
+        trial = filters.repeated(len(actions))
+        trial.assimilate(self.rules.instrument.measure(
+            self.faults, k + 1, self._resistance[k], currents, np.zeros_like(currents)), currents)
+        return trial.errors(self._moments[:, k], self._deviations[:, k], self._squares[:, k])
+
     def estimate(self) -> tuple[np.ndarray, np.ndarray]:
         """Return present means and standard deviations (B, n) in mol/m³; without an estimator the
         expected concentration and zero."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from copy import copy, deepcopy
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -177,6 +178,15 @@ class BodyParticleFilter:
         self.particles = Particles(centres, velocities, areas, np.ones((episodes, P), dtype=bool))
         self.weights = np.full((episodes, P), 1.0 / P)
         self._density: np.ndarray | None = None
+
+    def repeated(self, count: int) -> BodyParticleFilter:
+        """Return filters of ``count`` copies of the first episode."""
+        copies = copy(self)
+        copies._random = deepcopy(self._random)
+        copies.particles = Particles(*(np.repeat(each[:1], count, axis=0)
+                                       for each in self.particles))
+        copies.weights = np.repeat(self.weights[:1], count, axis=0)
+        return copies
 
     def assimilate(self, voltages: np.ndarray, currents: np.ndarray,
                    measured: np.ndarray) -> np.ndarray:

@@ -18,7 +18,7 @@ from eitbench.bench.statistics import MIN_EPISODES, agent_name, stratified_boots
 OPEN_LOOP = ("adjacent", "opposite", "transverse", "best_pair", "best_cycle", "best_currents",
              "schedule")
 """Built-in policies whose injections do not depend on the measurements."""
-NOT_ADAPTIVE = {*OPEN_LOOP, "random_pair", "clairvoyant", "true_position"}
+NOT_ADAPTIVE = {*OPEN_LOOP, "random_pair", "clairvoyant", "one_step_oracle"}
 """These, the naive baseline, and policies with access to the ground truth."""
 
 

@@ -354,23 +354,18 @@ class BodyBelief:
         """Assimilate the outcome of the last injection."""
         self._filters.assimilate(observation["voltages"][None], observation["currents"][None])
 
-    def criteria(self, centre: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
+    def criteria(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the A- and D-criterion of each pair, (pairs,) each, of the next injection.
 
         They treat particles and voltages as jointly Gaussian: the decrease of the expected squared
         error of the image on the coarse grid, and half of the decrease of the log-determinant of
-        the voltages' covariance. For oracles, ``centre`` (2,) in m is the true position of a
-        present body, to which the mean of the predicted particles is moved.
+        the voltages' covariance.
         """
-        model = self._filters.filter.model
         filters = self._filters.filter
+        model = filters.model
         # the random numbers of the filter's next step are not known
         particles, (weights,) = model.move(filters.particles, filters.weights,
                                            np.random.default_rng(1))
-        if centre is not None:
-            moved = particles.centres + centre - weights @ particles.centres[0]
-            particles = particles._replace(centres=model.motion.within(moved),
-                                           present=np.ones_like(particles.present))
         index, shares = model.cells(particles)
         cells = sp.csr_array((shares.ravel(), index.ravel(), np.arange(0, index.size + 1, 4)),
                              shape=(len(weights), len(self._functionals)))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from copy import copy
 from functools import lru_cache
 from typing import TYPE_CHECKING
 
@@ -33,6 +34,13 @@ class BodyFilters(EpisodeFilters):
         measured = self._rules.instrument.measurement_mask(currents)
         innovations = self.filter.assimilate(voltages, currents, measured)
         return innovations, np.ones(measured.shape, dtype=bool)
+
+    def repeated(self, count: int) -> BodyFilters:
+        """Return filters of ``count`` copies of the first episode."""
+        copies = copy(self)
+        copies.filter = self.filter.repeated(count)
+        copies._doubt = np.repeat(self._doubt[:1], count, axis=0)
+        return copies
 
     def innovations(self) -> list[Innovation | None]:
         return [Innovation.of(*each) for each in zip(*self.filter.innovation, strict=True)]

@@ -1,0 +1,28 @@
+"""One-step oracle: the pair with the smallest true error after the next measurement.
+
+It evaluates every pair with the true voltages without noise, and knows nothing of later steps. It
+indicates the error that a policy could attain with its own measurements, unlike an oracle that
+knows of a body before it has been measured.
+"""
+
+import numpy as np
+
+from eitbench.envs.injection_core import InjectionCore
+from eitbench.estimation.onboard.policies import PairPolicy
+from eitbench.estimation.onboard.rules import Rules
+
+
+class Policy(PairPolicy):
+    privileged = True
+    role = "reference"
+
+    @classmethod
+    def suits(cls, rules: Rules) -> bool:
+        return rules.tracks_body
+
+    def __init__(self, rules: Rules, random: np.random.Generator, core: InjectionCore) -> None:
+        super().__init__(rules, random)
+        self.core = core
+
+    def pair(self, observation: dict[str, np.ndarray]) -> int:
+        return int(self.core.trial_errors(np.arange(len(self.rules.pairs))).argmin())
