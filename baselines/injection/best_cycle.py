@@ -1,7 +1,7 @@
 """Best cycle: round-robin over up to four pairs, optimised on training episodes; a budget is used
 at equal intervals.
 
-For a body in a tank a pair that rotates around the tank is better.
+For a body that stays in a tank a pair that rotates around the tank is better.
 """
 
 from typing import Any
@@ -19,12 +19,12 @@ class Policy(CyclePolicy):
         "cycle": {"Pipe2D": [[0, 8]], "Pipe2D with faults": [[8, 11], [0, 4], [2, 8], [0, 14]],
                   "Pipe2DIntermittent with a budget": [[0, 10]],
                   "Pipe2DDriftingVelocity": [[7, 8], [1, 7]], "RotatingTank2D": [[9, 15]],
-                  "TankTracking": ROTATION, "SearchAndTrack": ROTATION,
+                  "TankTracking": ROTATION, "SearchAndTrack": [[4, 13], [3, 14], [0, 10]],
                   "BubbleTracking": [[2, 10], [4, 12], [2, 10]]},
         "environment_steps": {
             "Pipe2D": 346_368, "Pipe2D with faults": 608_768,
             "Pipe2DIntermittent with a budget": 768_768, "Pipe2DDriftingVelocity": 217_792,
-            "RotatingTank2D": 333_696, "TankTracking": 712_704, "SearchAndTrack": 844_800,
+            "RotatingTank2D": 333_696, "TankTracking": 712_704, "SearchAndTrack": 712_704,
             "BubbleTracking": 546_816}}
 
     @classmethod

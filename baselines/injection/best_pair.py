@@ -13,7 +13,7 @@ class Policy(CyclePolicy):
         "pair": {"Pipe2D": [0, 8], "Pipe2D with faults": [0, 8],
                  "Pipe2DIntermittent with a budget": [0, 10], "Pipe2DDriftingVelocity": [7, 9],
                  "RotatingTank2D": [9, 15], "TankTracking": [8, 14],
-                 "SearchAndTrack": [3, 12], "BubbleTracking": [2, 10]},
+                 "SearchAndTrack": [2, 12], "BubbleTracking": [2, 10]},
         "environment_steps": {
             "Pipe2D": 314_880, "Pipe2D with faults": 314_880,
             "Pipe2DIntermittent with a budget": 698_880, "Pipe2DDriftingVelocity": 157_440,

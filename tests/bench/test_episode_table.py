@@ -18,11 +18,15 @@ RESULTS = bundled_path("leaderboards") / "results"
 
 
 def test_the_published_table_agrees_with_the_records():
-    """`eitbench leaderboard --records leaderboards/results` would not change it, and `load` returns the same data."""
+    """`eitbench leaderboard --records leaderboards/results` would not change it, and `load` returns the same data, with
+    four digits of the times."""
     text = lzma.decompress((RESULTS.parent / TABLE_NAME).read_bytes()).decode()
     records = read_records(RESULTS)
     assert text == episode_table(records), "run `eitbench leaderboard --records leaderboards/results`"
-    pd.testing.assert_frame_equal(load(RESULTS.parent / "none"), load(), check_exact=True)
+    shipped, full = load(RESULTS.parent / "none"), load()
+    pd.testing.assert_frame_equal(shipped, full, check_exact=False, rtol=5e-4, atol=0.0)
+    times = full["metric"] == "seconds_per_step"
+    pd.testing.assert_frame_equal(shipped[~times], full[~times], check_exact=True)
     assert bundled_anchors(records) == anchors(records)
 
 
