@@ -20,12 +20,12 @@ class Policy(CyclePolicy):
                   "Pipe2DIntermittent with a budget": [[0, 10]],
                   "Pipe2DDriftingVelocity": [[7, 8], [1, 7]], "RotatingTank2D": [[9, 15]],
                   "TankTracking": ROTATION, "SearchAndTrack": [[4, 13], [3, 14], [0, 10]],
-                  "BubbleTracking": [[3, 8], [3, 11], [1, 10]]},
+                  "BubbleTracking": [[2, 10], [4, 12], [2, 10]]},
         "environment_steps": {
             "Pipe2D": 346_368, "Pipe2D with faults": 608_768,
             "Pipe2DIntermittent with a budget": 768_768, "Pipe2DDriftingVelocity": 217_792,
             "RotatingTank2D": 333_696, "TankTracking": 712_704, "SearchAndTrack": 712_704,
-            "BubbleTracking": 580_608}}
+            "BubbleTracking": 1_127_424}}
 
     @classmethod
     def suits(cls, rules: Rules) -> bool:
