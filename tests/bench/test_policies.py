@@ -14,7 +14,14 @@ from eitbench.data.seeds import parse_seeds
 from eitbench.envs.injection import InjectionEnv
 from eitbench.estimation.onboard.belief import Belief
 from eitbench.estimation.onboard.rules import Rules
-from eitbench.report.policies import adaptive_ratio, adaptivity_gap, errors_by_policy, gap_text, policy_rows
+from eitbench.report.policies import (
+    adaptive_ratio,
+    adaptivity_gap,
+    attained_fraction,
+    errors_by_policy,
+    gap_text,
+    policy_rows,
+)
 from eitbench.worlds.catalogue import PIPE_2D
 from scipy.stats import t as student
 
@@ -278,6 +285,14 @@ def test_adaptivity_gap_is_the_formula():
     assert adaptivity_gap(table, ["a", "b"]) == (gap, low, high)
     same = hand_made(clairvoyant=[1.0] * 9, random_pair=[5.0] * 9, a=[2.0] * 9)
     assert adaptivity_gap(same, ["a"]) == (0.25, 0.25, 0.25)
+
+
+def test_attained_fraction_is_that_of_the_way_to_the_oracle():
+    table = hand_made(best_cycle=[2.0, 4.0, 6.0], greedy_a=[1.0, 3.0, 2.0], one_step_oracle=[1.0, 1.0, 1.0])
+    assert attained_fraction(table) == ("greedy_a", "best_cycle", pytest.approx(2.0 / 3.0), -np.inf, np.inf)
+    assert "(best_cycle − greedy_a) / (best_cycle − one_step_oracle): 0.67" in gap_text(table.assign(ospa=None))
+    with pytest.raises(KeyError):
+        attained_fraction(table[table["policy"] != "one_step_oracle"])
 
 
 def test_adaptive_ratio_is_the_ratio_of_means():
