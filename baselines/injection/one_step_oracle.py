@@ -1,8 +1,8 @@
 """One-step oracle: the pair with the smallest true error after the next measurement.
 
-It evaluates every pair with the true voltages without noise, and knows nothing of later steps. It
-indicates the error that a policy could attain with its own measurements, unlike an oracle that
-knows of a body before it has been measured.
+It evaluates every pair with the true voltages without noise, for the next step only. It indicates
+the error that a policy could attain with its own measurements: it cannot measure a body before its
+entry.
 """
 
 import numpy as np

@@ -134,9 +134,7 @@ def train(
                          f"{' and '.join(f'{n} of {seeds}' for seeds, n in missing.items())}; "
                          "`eitbench bank` simulates them in advance on all cores")
         model = training.train(env, algo.value, asked, seed, folder)
-    table = np.load(folder / "evaluations.npz")
-    chosen = table["results"].mean(axis=1).argmax() if asked.select else -1
-    last = {name: values[chosen] for name, values in table.items()}
+    last = {name: values[-1] for name, values in np.load(folder / "evaluations.npz").items()}
     options.echo(f"wrote {model}: ẽ_c {last['errors'].mean():.3g}, return "
                  f"{last['results'].mean():.3g} in {len(last['errors'])} dev episodes, with the "
                  f"reduced filter, after {last['timesteps']} steps")

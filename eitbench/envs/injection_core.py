@@ -247,7 +247,7 @@ class InjectionCore(EpisodeCore):
         self.load_until(k + 1)
         currents = self.rules.currents(actions)
         filters: Any = self._filters
-        trial = filters.repeated(len(actions))
+        trial = filters.repeat(len(actions))
         trial.assimilate(self.rules.instrument.measure(
             self.faults, k + 1, self._resistance[k], currents, np.zeros_like(currents)), currents)
         return trial.errors(self._moments[:, k], self._deviations[:, k], self._squares[:, k])

@@ -179,7 +179,7 @@ class BodyParticleFilter:
         self.weights = np.full((episodes, P), 1.0 / P)
         self._density: np.ndarray | None = None
 
-    def repeated(self, count: int) -> BodyParticleFilter:
+    def repeat(self, count: int) -> BodyParticleFilter:
         """Return filters of ``count`` copies of the first episode."""
         copies = copy(self)
         copies._random = deepcopy(self._random)

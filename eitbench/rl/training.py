@@ -82,8 +82,6 @@ class TrainingConfig:
     """further arguments of the algorithm in stable-baselines3"""
     reference: str = ""
     """name or path of a policy whose reward in the same episode is subtracted (reward baseline)"""
-    select: bool = False
-    """keep the checkpoint with the largest mean return on dev episodes instead of the last one"""
     imitate: dict[str, Any] = field(default_factory=dict)
     """arguments of imitation learning before reinforcement, e.g. ``teacher``; see `imitate`"""
 
@@ -96,8 +94,7 @@ class TrainingConfig:
                 ("imitate", dict, "a dict of names and values"),
                 ("hidden", (tuple, list), "a list of integers"),
                 ("reference", str, "the name or path of a policy"),
-                ("anneal", bool, "true or false"),
-                ("select", bool, "true or false")):
+                ("anneal", bool, "true or false")):
             if not isinstance(getattr(self, name), kind):
                 raise ValueError(f"{name} must be {words}, got {getattr(self, name)!r}")
         for units in self.hidden:
@@ -165,11 +162,9 @@ def train(env: str, algo: str, config: TrainingConfig, seed: int, folder: Path,
     envs = vector_env(env, kwargs, config)
     asked = {"env": env, "kwargs": kwargs or {}, "algo": algo, "seed": seed,
              "config": asdict(config)}
-    settings, made, latest, best = (
-        folder / name for name in ("config.json", "model.zip", "latest.zip", "best.zip"))
+    settings, made, latest = (folder / name for name in ("config.json", "model.zip", "latest.zip"))
     if settings.exists():
-        defaults = asdict(TrainingConfig(config.total_steps))
-        there, here = (defaults | each | each.get("config", {}) for each in (
+        there, here = (each | each.get("config", {}) for each in (
             json.loads(settings.read_text()), json.loads(json.dumps(asked))))
         if differ := [name for name in here if name != "config"
                       and there.get(name, "unknown") != here[name]]:
@@ -202,19 +197,16 @@ def train(env: str, algo: str, config: TrainingConfig, seed: int, folder: Path,
         if config.imitate:
             imitate(model, world, config.imitate, config.reward_scale, inner.reference, seed)
         save_model(model, latest)
-    callback = _Checkpoints(folder, config, make_evaluator(env, kwargs, config))
+    callback = _Checkpoints(folder, config.interval, make_evaluator(env, kwargs, config))
     if not (folder / "evaluations.npz").exists():
         callback.evaluate(model)
     if (left := config.total_steps - model.num_timesteps) > 0:
         model.learn(left, callback=callback, reset_num_timesteps=False, tb_log_name="run",
                     progress_bar=sys.stderr.isatty())
-    if config.select:
-        model = ALGORITHMS[algo].load(best, device="cpu")
     _clear_optimisers(model)
     save_model(model, made)
     write_atomically(folder / "sha256", hashlib.sha256(made.read_bytes()).hexdigest().encode())
     latest.unlink()
-    best.unlink(missing_ok=True)
     learning.close()
     return made
 
@@ -326,12 +318,11 @@ def _clear_optimisers(model: BaseAlgorithm) -> None:
 class _Checkpoints(BaseCallback):
     """Callback that evaluates and stores the agent at every interval and at the end."""
 
-    def __init__(self, folder: Path, config: TrainingConfig,
+    def __init__(self, folder: Path, interval: int,
                  evaluator: Callable[[BaseAlgorithm], tuple[np.ndarray, ...]]) -> None:
         super().__init__()
         self.folder = folder
-        self.interval = config.interval
-        self.select = config.select
+        self.interval = interval
         self.evaluator = evaluator
 
     def _on_training_start(self) -> None:
@@ -350,8 +341,8 @@ class _Checkpoints(BaseCallback):
         save_model(self.model, self.folder / "latest.zip")
 
     def evaluate(self, model: BaseAlgorithm) -> tuple[np.ndarray, np.ndarray]:
-        """Append errors and returns (episodes,) to the table, remove rows of the same or a larger
-        number of steps, which belong to lost checkpoints, and store the best agent."""
+        """Append errors and returns (episodes,) to the table, and remove rows of the same or a
+        larger number of steps, which belong to lost checkpoints."""
         errors, returns, lengths = self.evaluator(model)
         row: dict[str, Any] = {"timesteps": model.num_timesteps, "results": returns,
                                "ep_lengths": lengths, "errors": errors}
@@ -361,9 +352,6 @@ class _Checkpoints(BaseCallback):
             table = np.load(path)
             kept = table["timesteps"] < model.num_timesteps
             rows = {name: [*table[name][kept], value] for name, value in row.items()}
-        means = np.mean(rows["results"], axis=1)
-        if self.select and means.argmax() == len(means) - 1:
-            save_model(model, self.folder / "best.zip")
         content = io.BytesIO()
         np.savez(content, **rows)
         write_atomically(path, content.getvalue())

@@ -160,17 +160,6 @@ def test_a_killed_run_loses_no_more_than_an_interval(tmp_path, monkeypatch):
         load_method(str(path), "injection")
 
 
-def test_the_best_checkpoint_is_selected(tmp_path):
-    """The agent is the one of the evaluation with the largest mean return, here not the last one."""
-    config = replace(TINY, select=True, total_steps=64, algorithm=TINY.algorithm | {"learning_rate": 0.1})
-    path = train(NAME, "ppo", config, 1, tmp_path, SHORT)
-    table = np.load(tmp_path / "evaluations.npz")
-    best = table["results"].mean(axis=1).argmax()
-    assert best < len(table["timesteps"]) - 1
-    assert ALGORITHMS["ppo"].load(path).num_timesteps == table["timesteps"][best]
-    assert not list(tmp_path.glob("*est.zip"))
-
-
 def test_the_same_seed_learns_the_same(tmp_path):
     """Two runs give the same networks, for any number of threads; another seed gives others."""
     config = replace(TINY, n_envs=32, total_steps=256)            # large enough for multithreaded products

@@ -35,10 +35,10 @@ class BodyFilters(EpisodeFilters):
         innovations = self.filter.assimilate(voltages, currents, measured)
         return innovations, np.ones(measured.shape, dtype=bool)
 
-    def repeated(self, count: int) -> BodyFilters:
+    def repeat(self, count: int) -> BodyFilters:
         """Return filters of ``count`` copies of the first episode."""
         copies = copy(self)
-        copies.filter = self.filter.repeated(count)
+        copies.filter = self.filter.repeat(count)
         copies._doubt = np.repeat(self._doubt[:1], count, axis=0)
         return copies
 
