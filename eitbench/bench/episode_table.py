@@ -44,12 +44,12 @@ def episode_table(records: Iterable[dict[str, Any]]) -> str:
     writer.writeheader()
     for record, episode in rows:
         environment = record["environment"]
-        writer.writerow(record | episode | episode.get("scores", {}) | {
+        numbers = {name: f"{value:.4g}" if name == "seconds_per_step" else value
+                   for name, value in episode.get("scores", {}).items()}
+        writer.writerow(record | episode | numbers | {
             "id": environment["id"], "environment": environment["name"],
             "kwargs": json.dumps(environment["kwargs"], sort_keys=True),
-            "finished": max(each["finished"] for each in record["episodes"])}
-            | {name: f"{time:.4g}" for name, time in episode.get("scores", {}).items()
-               if name == "seconds_per_step"})
+            "finished": max(each["finished"] for each in record["episodes"])})
     return text.getvalue()
 
 
