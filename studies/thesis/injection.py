@@ -25,15 +25,15 @@ from .common import ACCENT, GREY, INK, despine, save_figure
 WORLDS = {"eitbench/Pipe2DInjectionFaults-v0": "faulty electrodes",
           "eitbench/Pipe2DInjectionBudget-v0": "a budget",
           "eitbench/Pipe2DInjectionFlow-v0": "unknown flow",
-          "eitbench/Pipe2DInjection-v0": "plain pipe (reference)",
-          "eitbench/Pipe2DInjectionCurrents-v0": "any currents (reference)",
-          "eitbench/RotatingTankInjection-v0": "stirred tank (reference)"}
+          "eitbench/TankTracking-v0": "a moving body",
+          "eitbench/SearchAndTrack-v0": "a body that comes and goes",
+          "eitbench/BubbleTracking-v0": "bubbles in a pipe"}
 KINDS = {INK: "open loop", ACCENT: "adaptive", GREY: "* uses the ground truth"}
 THIN, THICK = 1.2, 4.0
 LINES = {THIN: "95 % interval",
          THICK: "95 % interval of the paired difference to the best ranked policy"}
 ADAPTIVE_ENVS = list(WORLDS)[:3]
-"""Environments with trained agents."""
+"""Environments whose agents learn by reinforcement."""
 ANIMATED = ("eitbench/Pipe2DInjectionFaults-v0", "fault_aware")
 """Environment and policy of the animation."""
 
