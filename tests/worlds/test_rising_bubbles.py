@@ -140,28 +140,3 @@ def test_filter_follows_bubbles():
         errors += [np.hypot(*(body[:2] - path.centres[core.t])) for body, path in
                    zip(core.body(), true, strict=True) if path.present[core.t] and body[-1] > 0.5]
     assert len(errors) > 20 and np.median(errors) < 0.012
-
-
-def test_oracle_centres_the_particles_on_the_bubble():
-    """A pair next to the bubble is the best one when its position is known."""
-    core = InjectionCore(Rules(BUBBLES), "reduced")
-    core.reset([0])
-    belief = BodyBelief(core.rules, {name: array[0] for name, array in core.observe().items()})
-    for x in (0.1, 0.3):
-        best = core.rules.pairs[belief.criteria(np.array([x, 0.0]))[0].argmax()]
-        assert np.abs((best % 8 + 0.5) * LENGTH / 8 - x).min() < 0.06
-
-
-@pytest.mark.parametrize(("changes", "message"), [
-    ({"target": {"radius_range": (0.01, 0.045)}}, "target.radius_range and amplitude_range must have a sum"),
-    ({"target": {"slip_range": (0.3, 0.1)}}, "slip_range must be a range"),
-    ({"target": {"mean_wait": 0.0}}, "mean_wait must be"),
-    ({"vessel": PlanePipe(bulge=Bulge())}, "target must be in a PlanePipe without a bulge"),
-    ({"vessel": RoundTank()}, "target must be in a PlanePipe without a bulge"),
-    ({"flow": NoFlow()}, "flow must be a flow through the pipe")])
-def test_an_invalid_world_is_refused(changes, message):
-    with pytest.raises(ValueError, match=message):
-        World(**{name: getattr(BUBBLES, name) for name in ("name", "vessel", "flow", "target", "instrument", "schedule",
-                                                           "prior")}
-              | {name: part for name, part in changes.items() if not isinstance(part, dict)}
-              ).with_changes({name: part for name, part in changes.items() if isinstance(part, dict)})
