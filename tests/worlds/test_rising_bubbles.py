@@ -7,7 +7,6 @@ import pytest
 from eitbench.data.episodes import cached_truth_model
 from eitbench.envs.injection_core import InjectionCore
 from eitbench.estimation.body_particles import BodyParticleFilter, body_model
-from eitbench.estimation.onboard.belief import BodyBelief
 from eitbench.estimation.onboard.rules import Rules
 from eitbench.worlds.bodies import TRANSITION_WIDTH, disc_indicator
 from eitbench.worlds.flows import NoFlow
@@ -140,3 +139,18 @@ def test_filter_follows_bubbles():
         errors += [np.hypot(*(body[:2] - path.centres[core.t])) for body, path in
                    zip(core.body(), true, strict=True) if path.present[core.t] and body[-1] > 0.5]
     assert len(errors) > 20 and np.median(errors) < 0.012
+
+
+@pytest.mark.parametrize(("changes", "message"), [
+    ({"target": {"radius_range": (0.01, 0.045)}}, "target.radius_range and amplitude_range must have a sum"),
+    ({"target": {"slip_range": (0.3, 0.1)}}, "slip_range must be a range"),
+    ({"target": {"mean_wait": 0.0}}, "mean_wait must be"),
+    ({"vessel": PlanePipe(bulge=Bulge())}, "target must be in a PlanePipe without a bulge"),
+    ({"vessel": RoundTank()}, "target must be in a PlanePipe without a bulge"),
+    ({"flow": NoFlow()}, "flow must be a flow through the pipe")])
+def test_an_invalid_world_is_refused(changes, message):
+    with pytest.raises(ValueError, match=message):
+        World(**{name: getattr(BUBBLES, name) for name in ("name", "vessel", "flow", "target", "instrument", "schedule",
+                                                           "prior")}
+              | {name: part for name, part in changes.items() if not isinstance(part, dict)}
+              ).with_changes({name: part for name, part in changes.items() if isinstance(part, dict)})
