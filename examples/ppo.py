@@ -17,7 +17,6 @@ import torch
 from torch import Tensor, nn
 from torch.distributions import Categorical
 
-import eitbench  # noqa: F401  (registers the ids)
 from eitbench.data.seeds import parse_seeds
 
 GAMMA, LAMBDA = 0.9, 0.95
@@ -46,13 +45,13 @@ def roll_out(envs: gym.vector.VectorEnv, choose: Callable[[Tensor], Tensor],
     return torch.stack(seen), torch.stack(actions), torch.stack(rewards)
 
 
-def advantages(rewards: Tensor, values: Tensor) -> Tensor:
+def estimate_advantages(rewards: Tensor, values: Tensor) -> Tensor:
     """Return generalised advantage estimates (T, B); the value after the last step is zero."""
     result = torch.zeros_like(rewards)
-    gain = following = torch.zeros_like(values[0])
+    advantage = following = torch.zeros_like(values[0])
     for t in reversed(range(len(rewards))):
-        gain = rewards[t] + GAMMA * following - values[t] + GAMMA * LAMBDA * gain
-        result[t], following = gain, values[t]
+        advantage = rewards[t] + GAMMA * following - values[t] + GAMMA * LAMBDA * advantage
+        result[t], following = advantage, values[t]
     return result
 
 
@@ -72,23 +71,26 @@ def train(envs: gym.vector.VectorEnv, steps: int, seed: int = 1) -> nn.Sequentia
                 None if done else seed)
             before = Categorical(logits=actor(seen)).log_prob(actions).flatten()
             values = critic(seen).squeeze(-1)
-            gains = advantages(REWARD_SCALE * rewards, values)
-            targets = (gains + values).flatten()
-        seen, actions, gains = seen.flatten(0, 1), actions.flatten(), gains.flatten()
+            advantages = estimate_advantages(REWARD_SCALE * rewards, values).flatten()
+            targets = advantages + values.flatten()
+        seen, actions = seen.flatten(0, 1), actions.flatten()
         for _ in range(EPOCHS):
             for part in torch.randperm(len(seen)).chunk(MINIBATCHES):
                 policy = Categorical(logits=actor(seen[part]))
                 ratio = (policy.log_prob(actions[part]) - before[part]).exp()
-                gain = (gains[part] - gains[part].mean()) / (gains[part].std() + 1e-8)
-                clipped = torch.minimum(ratio * gain,
-                                        ratio.clamp(1.0 - CLIP, 1.0 + CLIP) * gain)
+                advantage = advantages[part]
+                advantage = (advantage - advantage.mean()) / (advantage.std() + 1e-8)
+                clipped = torch.minimum(ratio * advantage,
+                                        ratio.clamp(1.0 - CLIP, 1.0 + CLIP) * advantage)
                 error = (critic(seen[part]).squeeze(-1) - targets[part]).square()
                 loss = -clipped.mean() + 0.5 * error.mean() - ENTROPY * policy.entropy().mean()
                 optimiser.zero_grad()
                 loss.backward()
                 nn.utils.clip_grad_norm_(parameters, 0.5)
                 optimiser.step()
-        if done // (steps / 20) < (done := done + len(seen)) // (steps / 20):
+        printed = 20 * done // steps
+        done += len(seen)
+        if 20 * done // steps > printed:
             print(f"{done:9,} steps, training return {rewards.sum(0).mean():.3f}", flush=True)
     return actor
 

@@ -2,8 +2,8 @@
 
 Prints ẽ_c, on dev:0-31 with the reduced filter, and the parts that arise in the first five steps
 after a body enters and later, with the position within 5 mm, within 40 mm, or farther away. The
-last line is the error of the image with the true position and the true area: it remains for any
-filter, since its disc is on a coarse mesh and has a smooth edge.
+last line is the error of the image with the true position and area, a disc that the filter
+interpolates on a coarse mesh.
 """
 
 from __future__ import annotations

@@ -106,7 +106,7 @@ class BodyModel:
     def move(self, particles: Particles, weights: np.ndarray,
              random: np.random.Generator) -> tuple[Particles, np.ndarray]:
         """Move particles with their weights (B, P) by a time step, with the same random numbers in
-        all episodes; return them and their weights, which depend on entries only."""
+        all episodes; return them with their weights, which correct for the proposed entries."""
         centres, velocities, areas, present = particles
         motion = self.motion
         B, P = areas.shape

@@ -63,33 +63,23 @@ def adaptive_ratio(rows: pd.DataFrame) -> tuple[str, str, float, float, float]:
 
     ``ValueError`` unless policies of both kinds have run on all episodes.
     """
-    errors, adaptive, open_loop = _best_policies(rows)
-    return adaptive, open_loop, *_bootstrap(errors[[adaptive, open_loop]],
-                                            lambda mean: mean[0] / mean[1])
-
-
-def attained_fraction(rows: pd.DataFrame) -> tuple[str, str, float, float, float]:
-    """Return the best adaptive and the best open-loop policy, and (open loop − adaptive) /
-    (open loop − one-step oracle) of mean errors with the ends of its interval.
-
-    Errors as in `adaptive_ratio`; ``KeyError`` without the oracle.
-    """
-    errors, adaptive, open_loop = _best_policies(rows)
-    return adaptive, open_loop, *_bootstrap(
-        errors[[adaptive, open_loop, "one_step_oracle"]],
-        lambda mean: (mean[1] - mean[0]) / (mean[1] - mean[2]))
-
-
-def _best_policies(rows: pd.DataFrame) -> tuple[pd.DataFrame, str, str]:
-    """Return ẽ_c of policies that have run on all episodes, and the best adaptive and the best
-    open-loop policy."""
     errors = errors_by_policy(rows).dropna(axis=1)
     adaptive = next((str(name) for name in errors if name not in NOT_ADAPTIVE), None)
     open_loop = next((str(name) for name in errors if name in OPEN_LOOP), None)
     if adaptive is None or open_loop is None:
         raise ValueError("rows must hold an adaptive and an open-loop policy on the same episodes; "
                          f"got {', '.join(map(str, errors))}")
-    return errors, adaptive, open_loop
+    return adaptive, open_loop, *_bootstrap(errors[[adaptive, open_loop]],
+                                            lambda mean: mean[0] / mean[1])
+
+
+def attained_fraction(rows: pd.DataFrame, adaptive: str,
+                      open_loop: str) -> tuple[float, float, float]:
+    """Return (open loop − adaptive) / (open loop − one-step oracle) of mean errors with the ends of
+    its 95 % interval; ``KeyError`` unless these have run on all episodes."""
+    errors = errors_by_policy(rows).dropna(axis=1)
+    return _bootstrap(errors[[open_loop, adaptive, "one_step_oracle"]],
+                      lambda mean: (mean[0] - mean[1]) / (mean[0] - mean[2]))
 
 
 def _bootstrap(errors: pd.DataFrame, statistic: Callable[[np.ndarray], Any],
@@ -105,17 +95,16 @@ def gap_text(rows: pd.DataFrame) -> str:
     """Return ratio, attained fraction and normalised adaptivity gap as text, without those for
     which an episode lacks a policy."""
     texts = []
-    with suppress(ValueError):
+    with suppress(KeyError, ValueError):
         adaptive, open_loop, *ratio = adaptive_ratio(rows)
         texts.append(f"error of {adaptive} / {open_loop}: {_with_interval(*ratio)}")
+        fraction = attained_fraction(rows, adaptive, open_loop)
+        texts.append(f"({open_loop} − {adaptive}) / ({open_loop} − one_step_oracle): "
+                     f"{_with_interval(*fraction)}")
     with suppress(KeyError, ValueError):        # of worlds with a body that moves by itself
         adaptive, open_loop, *ratio = adaptive_ratio(
             rows.assign(error=pd.to_numeric(rows["ospa"])**2))
         texts.append(f"mean squared OSPA of {adaptive} / {open_loop}: {_with_interval(*ratio)}")
-    with suppress(KeyError, ValueError):
-        adaptive, open_loop, *fraction = attained_fraction(rows)
-        texts.append(f"({open_loop} − {adaptive}) / ({open_loop} − one_step_oracle): "
-                     f"{_with_interval(*fraction)}")
     with suppress(ValueError):
         texts.append(f"normalised adaptivity gap {_with_interval(*adaptivity_gap(rows))}")
     episodes = f" over {rows['seed'].nunique()} episodes"
