@@ -164,6 +164,14 @@ def test_docstrings_and_files_are_of_the_recorded_version():
         assert (file in rendered([agent])["methods/maskable_ppo_seed0.html"]) == (digest == ours)
 
 
+def test_agents_of_several_environments_have_no_common_title():
+    """Their page has the name as its heading; agents of one environment have a title."""
+    one, other = (record("ppo_seed0", of(0.5), id=id, board="injection", title=f"imitation in {id}",
+                         parameters={"env": id}) for id in (BUDGET, "eitbench/TankTracking-v0"))
+    for records, heading in (([one], one["title"]), ([one, other], "ppo_seed0")):
+        assert f"<h1>{heading}</h1>" in rendered(records)["methods/ppo_seed0.html"]
+
+
 def test_every_environment_is_documented():
     """The description precedes tables; its headings are below the page's heading."""
     for id in ids():

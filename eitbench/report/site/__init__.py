@@ -272,8 +272,10 @@ def method_page(site: Site, name: str) -> bytes:
         key = record["version"], str(record["parameters"].get("env"))
         versions.setdefault(key, []).append(record)
     table, axes = _placements(placements)
+    # agents of several environments have no common title
+    title = name if len({env for _, env in versions}) > 1 else records[0]["title"]
     return site.page(
-        "method", "../", name=name, title=records[0]["title"], placements=table, axes=axes,
+        "method", "../", name=name, title=title, placements=table, axes=axes,
         checkout="../../../" if METHODS_FOLDER in site.assets else "",
         versions=[_version(own, addresses) for own in versions.values()])
 
