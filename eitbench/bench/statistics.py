@@ -34,6 +34,9 @@ Scores = Mapping[str, Mapping[str, float]]
 Statistic = Callable[..., Any]
 """Maps one array (..., n_e) for each environment to (...), where ... are resamples."""
 N_RESAMPLES = 10_000
+ROUNDING = 1e-9
+"""Relative difference of means below which methods share a rank: their runs on different processors
+differ by rounding."""
 MIN_EPISODES = 6
 """Number of episodes required for an interval. If all n differences have the same sign, so has each
 resample, and the interval excludes zero; for two equal methods the probability is 2^(1 − n), above
@@ -136,7 +139,7 @@ def shared_ranks(scores: Mapping[str, Scores], *,
     better. Return method -> rank, in the order of the statistic, the best first.
 
     A method is significantly better if the interval of the `paired_difference` excludes zero on the
-    better side. Rank 1 means that no method is significantly better, rank 3 that two are. With too
+    better side, by more than `ROUNDING`. Rank 1 means that no method is significantly better, rank 3 that two are. With too
     few episodes for an interval (`has_enough_episodes`), all ranks are 1.
 
     The order by rank may differ from the order by the statistic. Each comparison is at 95 %,
@@ -159,7 +162,8 @@ def shared_ranks(scores: Mapping[str, Scores], *,
     cut = tail_percent(tuple(map(len, first)))
     # all methods have the same resamples, so the difference of two rows is paired
     drawn = {method: sign * _resample(strata[method], statistic, n_resamples) for method in order}
-    return {method: 1 + sum(bool(np.percentile(drawn[method] - drawn[other], cut) > 0.0)
+    return {method: 1 + sum(bool(np.percentile(drawn[method] - drawn[other], cut)
+                                 > ROUNDING * abs(values[method]))
                             for other in order) for method in order}
 
 

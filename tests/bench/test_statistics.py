@@ -204,6 +204,8 @@ PIPE_AND_TANK = {"b": {"pipe": seeded(np.ones(6)), "tank": seeded(np.zeros(60))}
     (board(last=10 * ONE, a=0.1 * NOISE, b=0.01 - 0.1 * NOISE), {}, {"a": 1, "b": 1, "last": 3}),
     (board(c=NOISE + 1, b=NOISE, a=NOISE), {}, {"a": 1, "b": 1, "c": 3}),
     (board(a=NOISE), {}, {"a": 1}), ({}, {}, {}),
+    # a difference by rounding in every episode
+    (board(a=ONE, b=(1.0 + 1e-12) * ONE), {}, {"a": 1, "b": 1}),
     # intervals of the scores overlap widely, but one is slightly better on every episode
     (board(a=100 * NOISE, b=100 * NOISE + 0.5), {}, {"a": 1, "b": 2}),
     # not transitive: no significant difference of a and b, nor of b and c, but a is better than c
