@@ -139,8 +139,8 @@ def shared_ranks(scores: Mapping[str, Scores], *,
     better. Return method -> rank, in the order of the statistic, the best first.
 
     A method is significantly better if the interval of the `paired_difference` excludes zero on the
-    better side, by more than `ROUNDING`. Rank 1 means that no method is significantly better, rank 3 that two are. With too
-    few episodes for an interval (`has_enough_episodes`), all ranks are 1.
+    better side, by more than `ROUNDING`. Rank 1 means that no method is significantly better, rank
+    3 that two are. With too few episodes for an interval (`has_enough_episodes`), all ranks are 1.
 
     The order by rank may differ from the order by the statistic. Each comparison is at 95 %,
     without correction for the number of comparisons (``docs/statistics.md``). ``ValueError`` if the
