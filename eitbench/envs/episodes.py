@@ -9,7 +9,7 @@ from concurrent.futures import ThreadPoolExecutor
 from copy import copy
 from dataclasses import replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -25,9 +25,7 @@ from eitbench.data.episode_cache import cached_episode, cached_episode_prefix, c
 from eitbench.data.presimulation import EpisodeSampler
 from eitbench.data.seeds import warn_test_seeds
 from eitbench.worlds.task import Task, make_task
-
-if TYPE_CHECKING:
-    from eitbench.worlds.world import World
+from eitbench.worlds.world import World
 
 Observation = dict[str, np.ndarray]
 RESET_NEEDED = "call reset() before step(), and again when an episode has ended"

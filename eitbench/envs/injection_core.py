@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from gymnasium import spaces
@@ -15,9 +15,7 @@ from eitbench.estimation.onboard.episode_filters import BODY, Innovation
 from eitbench.estimation.onboard.full_filters import filters_class
 from eitbench.estimation.onboard.rules import Rules
 from eitbench.worlds.instrument import Faults
-
-if TYPE_CHECKING:
-    from eitbench.worlds.world import World
+from eitbench.worlds.world import World
 
 OBSERVATION_FORMATS = ("scaled", "raw")
 MAX_SCALED = 5.0

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from eitbench.worlds.bodies import RisingBubble, reflect
-
-if TYPE_CHECKING:
-    from eitbench.worlds.task import Task
+from eitbench.worlds.task import Task
 
 SPACING = 5e-3
 """m, spacing of the grid on which signals and images of a body are tabulated."""

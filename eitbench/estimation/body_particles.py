@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from copy import copy, deepcopy
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import scipy.sparse as sp
@@ -13,12 +13,9 @@ import scipy.sparse as sp
 from eitbench.estimation.body_motion import SPACING, body_motion
 from eitbench.numerics.compiled import compiled_kernels
 from eitbench.numerics.fem import mass_matrix
+from eitbench.physics.observation import ObservationModel
 from eitbench.worlds.bodies import DISC_POINTS, DISC_WEIGHTS, TRANSITION_WIDTH, disc_indicator
-from eitbench.worlds.task import Estimate
-
-if TYPE_CHECKING:
-    from eitbench.physics.observation import ObservationModel
-    from eitbench.worlds.task import Task
+from eitbench.worlds.task import Estimate, Task
 
 POSITION_JITTER = 1e-3
 """m, standard deviation of the movement of a resampled particle."""

@@ -9,19 +9,14 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from eitbench.estimation.estimators import Measurement
-from eitbench.estimation.identified import has_fingerprint
+from eitbench.estimation.identified import IdentifiedModel, has_fingerprint
+from eitbench.estimation.inflow_prior import InflowPrior
 from eitbench.estimation.inflow_window import inflow_filter
-from eitbench.worlds.task import Estimate
-
-if TYPE_CHECKING:
-    from eitbench.estimation.identified import IdentifiedModel
-    from eitbench.estimation.inflow_prior import InflowPrior
-    from eitbench.worlds.task import Task
+from eitbench.worlds.task import Estimate, Task
 
 Network = Mapping[str, np.ndarray]
 

@@ -2,19 +2,14 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
 from eitbench import _check
 from eitbench.estimation.gaussian import Forward, LinearMeasurement
+from eitbench.estimation.inflow_prior import InflowPrior
 from eitbench.estimation.inflow_window import yule_walker
-from eitbench.worlds.task import Estimate
-
-if TYPE_CHECKING:
-    from eitbench.estimation.inflow_prior import InflowPrior
-    from eitbench.estimation.velocity import VelocityPrior
-    from eitbench.worlds.task import Task
+from eitbench.estimation.velocity import VelocityPrior
+from eitbench.worlds.task import Estimate, Task
 
 QUADRATURE_NODE = 3.0**0.5
 """Distance of the outer Gauss–Hermite nodes from the mean of θ, in standard deviations."""

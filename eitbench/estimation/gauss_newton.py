@@ -5,20 +5,17 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from contextlib import suppress
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
 from scipy.linalg import cho_factor, cho_solve, lu_factor, lu_solve
 
 from eitbench.estimation.nodal import initial_covariance
+from eitbench.numerics.mesh import Mesh
 from eitbench.numerics.sparse_lu import SparseLU
-from eitbench.worlds.task import Estimate
-
-if TYPE_CHECKING:
-    from eitbench.numerics.mesh import Mesh
-    from eitbench.physics.observation import VoltageModel, VoltageNoise
-    from eitbench.worlds.task import Task
+from eitbench.physics.observation import VoltageModel, VoltageNoise
+from eitbench.worlds.task import Estimate, Task
 
 
 def gauss_newton(model: VoltageModel, voltages: np.ndarray, currents: np.ndarray,

@@ -6,16 +6,14 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from functools import partial
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from scipy.linalg import cholesky, solve_triangular
 
 from eitbench.estimation.covariance import Covariance
-
-if TYPE_CHECKING:
-    from eitbench.physics.observation import VoltageModel, VoltageNoise
-    from eitbench.worlds.task import Task
+from eitbench.physics.observation import VoltageModel, VoltageNoise
+from eitbench.worlds.task import Task
 
 
 class LinearMeasurement(NamedTuple):

@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -17,10 +17,8 @@ from eitbench._files import write_atomically
 from eitbench._notice import notify
 from eitbench.data.seeds import SPLITS, format_seed
 from eitbench.worlds.registry import entries
-
-if TYPE_CHECKING:
-    from eitbench.worlds.task import Task
-    from eitbench.worlds.world import World
+from eitbench.worlds.task import Task
+from eitbench.worlds.world import World
 
 REGIME_KEYS = {"p_onset": "begins", "p_end": "ends", "quiet_variance_ratio": "quiet"}
 """Field of `Regimes` -> its key in files of priors."""

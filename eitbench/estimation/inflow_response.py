@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from functools import lru_cache
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from scipy.linalg import toeplitz
 
-if TYPE_CHECKING:
-    from eitbench.estimation.inflow_prior import InflowPrior
-    from eitbench.physics.transport import Transport
+from eitbench.estimation.inflow_prior import InflowPrior
+from eitbench.physics.transport import Transport
 
 DECAY_TOLERANCE = 0.01
 """The response ends where a smaller fraction of an inflow remains, in the Frobenius norm."""

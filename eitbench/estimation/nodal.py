@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import lru_cache
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -22,13 +22,11 @@ from eitbench.estimation.covariance import (
 from eitbench.estimation.filter import Filter, StateSpace
 from eitbench.estimation.gaussian import Forward
 from eitbench.estimation.walk import RandomWalk, smoothness_covariance
+from eitbench.numerics.mesh import Mesh
 from eitbench.physics.stationary import StationaryTransport
-
-if TYPE_CHECKING:
-    from eitbench.numerics.mesh import Mesh
-    from eitbench.physics.transport import Transport
-    from eitbench.worlds.task import Task
-    from eitbench.worlds.world import Prior
+from eitbench.physics.transport import Transport
+from eitbench.worlds.task import Task
+from eitbench.worlds.world import Prior
 
 FILTER_RANK_TOLERANCE = 1e-4
 """Rank tolerance of `LowRankCovariance`: estimates differ from the exact filter by 1e-7 standard

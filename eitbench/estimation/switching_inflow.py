@@ -5,7 +5,6 @@ from __future__ import annotations
 from copy import copy
 from dataclasses import replace
 from itertools import cycle
-from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.linalg import solve_triangular
@@ -14,12 +13,9 @@ from eitbench import _check
 from eitbench.estimation.covariance import DenseCovariance
 from eitbench.estimation.filter import Filter, Step
 from eitbench.estimation.gaussian import Forward, LinearMeasurement
+from eitbench.estimation.inflow_prior import InflowPrior
 from eitbench.estimation.inflow_window import InflowWindow, window_model
-from eitbench.worlds.task import Estimate
-
-if TYPE_CHECKING:
-    from eitbench.estimation.inflow_prior import InflowPrior
-    from eitbench.worlds.task import Task
+from eitbench.worlds.task import Estimate, Task
 
 NEGLIGIBLE = 1e-3
 """Particles with less than this fraction of the largest probability do not enter estimates."""

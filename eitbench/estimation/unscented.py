@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from eitbench.estimation.filter import Filter, LinearisedMeasurement, StateSpace
 from eitbench.estimation.gaussian import LinearMeasurement
+from eitbench.physics.observation import VoltageNoise
 from eitbench.worlds.task import Estimate
-
-if TYPE_CHECKING:
-    from eitbench.physics.observation import VoltageNoise
 
 SPREAD = 3.0**0.5
 """Distance of a sigma point from the mean in standard deviations (Gauss–Hermite nodes)."""

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.linalg import block_diag
@@ -13,14 +12,12 @@ from scipy.linalg import block_diag
 from eitbench import _check
 from eitbench.estimation.covariance import Covariance, DenseCovariance
 from eitbench.estimation.filter import StateSpace
+from eitbench.estimation.inflow_prior import InflowPrior
 from eitbench.estimation.inflow_response import one_step_response
 from eitbench.estimation.inflow_window import shift_window, window_model
 from eitbench.estimation.nodal import initial_covariance, state_noise
-
-if TYPE_CHECKING:
-    from eitbench.estimation.inflow_prior import InflowPrior
-    from eitbench.physics.transport import ConvectionDiffusion, VelocityField
-    from eitbench.worlds.task import Task
+from eitbench.physics.transport import ConvectionDiffusion, VelocityField
+from eitbench.worlds.task import Task
 
 
 @dataclass(frozen=True, eq=False)

@@ -5,16 +5,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
-from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy.linalg
 
 from eitbench import _check
-
-if TYPE_CHECKING:
-    from eitbench.numerics.mesh import Mesh
-    from eitbench.physics.transport import EvolutionModel
+from eitbench.numerics.mesh import Mesh
+from eitbench.physics.transport import EvolutionModel
 
 MODE_VARIANCE_CUTOFF = 1e-3
 """Modes with a smaller variance, relative to the largest, are dropped."""

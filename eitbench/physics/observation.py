@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Protocol
+from typing import Protocol
 
 import numpy as np
+import scipy.sparse as sp
 
 from eitbench import _check
-
-if TYPE_CHECKING:
-    import scipy.sparse as sp
-
-    from eitbench.physics.cem import CompleteElectrodeModel
+from eitbench.physics.cem import CompleteElectrodeModel
 
 
 class ConductivityLaw(Protocol):

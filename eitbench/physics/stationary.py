@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-if TYPE_CHECKING:
-    from eitbench.numerics.mesh import Mesh
-    from eitbench.physics.transport import EvolutionModel
+from eitbench.numerics.mesh import Mesh
+from eitbench.physics.transport import EvolutionModel
 
 
 @dataclass(frozen=True, eq=False)

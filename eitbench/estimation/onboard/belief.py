@@ -4,7 +4,6 @@ and the design criteria of the next injection."""
 from __future__ import annotations
 
 from functools import cached_property
-from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy.sparse as sp
@@ -12,12 +11,9 @@ import scipy.sparse as sp
 from eitbench.data.episode_cache import scoring_constants
 from eitbench.estimation.body_particles import measured_first
 from eitbench.estimation.onboard.body_filters import BodyFilters
-from eitbench.estimation.onboard.linearisation import linearisation_table
+from eitbench.estimation.onboard.linearisation import Linearisation, linearisation_table
 from eitbench.estimation.onboard.reduced_filters import ReducedFilters
-
-if TYPE_CHECKING:
-    from eitbench.estimation.onboard.linearisation import Linearisation
-    from eitbench.estimation.onboard.rules import Rules
+from eitbench.estimation.onboard.rules import Rules
 
 FAULT_THRESHOLD = 0.3
 """`Belief.fault_score` from which an electrode counts as faulty."""

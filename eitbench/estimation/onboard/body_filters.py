@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from copy import copy
 from functools import lru_cache
-from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy.sparse as sp
@@ -12,9 +11,7 @@ import scipy.sparse as sp
 from eitbench.estimation.body_particles import PARTICLES, BodyParticleFilter, body_model
 from eitbench.estimation.onboard.episode_filters import EpisodeFilters, Innovation
 from eitbench.estimation.onboard.linearisation import linearisation_table
-
-if TYPE_CHECKING:
-    from eitbench.worlds.world import World
+from eitbench.worlds.world import World
 
 
 class BodyFilters(EpisodeFilters):

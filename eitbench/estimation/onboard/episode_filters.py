@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from eitbench.data.episode_cache import score_mass, step_error
 from eitbench.estimation.onboard.linearisation import linearisation_table
-
-if TYPE_CHECKING:
-    from eitbench.estimation.onboard.rules import Rules
-
+from eitbench.estimation.onboard.rules import Rules
 
 BODY = ("x, m", "y, m", "velocity x, m/s", "velocity y, m/s", "std of x, m", "std of y, m",
         "correlation of x and y", "area relative to the mean", "probability of presence")

@@ -4,7 +4,7 @@ all filters."""
 from __future__ import annotations
 
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -19,11 +19,9 @@ from eitbench.estimation.onboard.inflow_states import fit_world_prior
 from eitbench.estimation.onboard.linearisation import linearisation_table, std_from_variance
 from eitbench.estimation.onboard.models import VELOCITY_BOUNDS
 from eitbench.estimation.onboard.reduced_filters import ReducedFilters
+from eitbench.estimation.onboard.rules import Rules
 from eitbench.estimation.velocity import VelocityStates, task_velocity_prior
-
-if TYPE_CHECKING:
-    from eitbench.estimation.onboard.rules import Rules
-    from eitbench.worlds.world import World
+from eitbench.worlds.world import World
 
 ESTIMATOR_OPTIONS = ("reduced", "full", "none")
 """Reduced filter for training, full filter for scores, or no filter."""

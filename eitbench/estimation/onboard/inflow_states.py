@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import lru_cache
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import scipy.linalg
@@ -23,9 +23,7 @@ from eitbench.estimation.inflow_response import ImpulseResponse, principal_direc
 from eitbench.estimation.inflow_window import yule_walker
 from eitbench.estimation.quadratic_voltages import ScaledVoltageModel, TransferResistanceModel
 from eitbench.estimation.reduced import ReducedStates, matvec
-
-if TYPE_CHECKING:
-    from eitbench.worlds.world import World
+from eitbench.worlds.world import World
 
 N_RECENT_INFLOWS = 8
 """D; with a smaller value, more of the inflow is linearised before it is measured."""

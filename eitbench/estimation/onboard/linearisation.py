@@ -5,15 +5,13 @@ from __future__ import annotations
 import math
 from functools import cached_property, lru_cache
 from itertools import combinations
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from eitbench.numerics.fem import mass_matrix
 from eitbench.worlds.task import make_task
-
-if TYPE_CHECKING:
-    from eitbench.worlds.world import World
+from eitbench.worlds.world import World
 
 C_REF_STEP = 0.02
 """Step of the grid of ln c_ref: c_ref is rounded to 2 %, so that episodes share linearisations."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from threadpoolctl import threadpool_limits
@@ -43,12 +43,9 @@ from eitbench.estimation.reduced import (
     reduced_model,
 )
 from eitbench.numerics.fem import mass_matrix
-from eitbench.worlds.task import make_task
-
-if TYPE_CHECKING:
-    from eitbench.physics.profiles import VelocityModel
-    from eitbench.worlds.task import Task
-    from eitbench.worlds.world import World
+from eitbench.physics.profiles import VelocityModel
+from eitbench.worlds.task import Task, make_task
+from eitbench.worlds.world import World
 
 VELOCITY_BOUNDS = (1 / 3, 2.0)
 """Bounds of the mean velocity, relative to the nominal one; narrower than in the built-in methods,

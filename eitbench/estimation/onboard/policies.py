@@ -4,14 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from itertools import cycle
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from eitbench.estimation.onboard.belief import Belief, BodyBelief
-
-if TYPE_CHECKING:
-    from eitbench.estimation.onboard.rules import Rules
+from eitbench.estimation.onboard.rules import Rules
 
 
 class PairPolicy:

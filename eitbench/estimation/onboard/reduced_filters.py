@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from functools import cache, lru_cache
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -19,11 +19,9 @@ from eitbench.estimation.onboard.models import (
     reduced_states,
     single_precision,
 )
+from eitbench.estimation.onboard.rules import Rules
 from eitbench.estimation.reduced import ReducedFilter, matvec
-
-if TYPE_CHECKING:
-    from eitbench.estimation.onboard.rules import Rules
-    from eitbench.worlds.world import World
+from eitbench.worlds.world import World
 
 
 class ReducedFilters(EpisodeFilters):

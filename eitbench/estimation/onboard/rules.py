@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from gymnasium import spaces
@@ -11,10 +11,8 @@ from gymnasium import spaces
 from eitbench import _check
 from eitbench.estimation.onboard.linearisation import electrode_pairs, pair_currents
 from eitbench.worlds.bodies import MovingBody
-
-if TYPE_CHECKING:
-    from eitbench.worlds.instrument import Instrument
-    from eitbench.worlds.world import World
+from eitbench.worlds.instrument import Instrument
+from eitbench.worlds.world import World
 
 INFLOW_MODELS = ("white", "learned")
 """Inflow priors of the estimator: white noise (Table 5.1), or a coloured logarithm fitted to
