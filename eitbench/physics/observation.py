@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
-import scipy.sparse as sp
 
 from eitbench import _check
-from eitbench.physics.cem import CompleteElectrodeModel
+
+if TYPE_CHECKING:
+    import scipy.sparse as sp
+
+    from eitbench.physics.cem import CompleteElectrodeModel
 
 
 class ConductivityLaw(Protocol):
