@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from eitbench.numerics.mesh import Mesh
-from eitbench.physics.transport import EvolutionModel
+if TYPE_CHECKING:
+    from eitbench.numerics.mesh import Mesh
+    from eitbench.physics.transport import EvolutionModel
 
 
 @dataclass(frozen=True, eq=False)
