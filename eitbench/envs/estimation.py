@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from gymnasium import spaces
@@ -17,13 +17,15 @@ from eitbench.data.episode_cache import (
     step_error,
     velocity_error,
 )
-from eitbench.data.episodes import Episode
 from eitbench.envs.episodes import EpisodeCore, EpisodeEnv, EpisodeVectorEnv, Observation
-from eitbench.physics.transport import Transport
 from eitbench.worlds.random_streams import episode_streams
 from eitbench.worlds.registry import entry
 from eitbench.worlds.task import lag_steps, make_task
 from eitbench.worlds.world import Discretisation, World
+
+if TYPE_CHECKING:
+    from eitbench.data.episodes import Episode
+    from eitbench.physics.transport import Transport
 
 
 class PrivilegedInfo(NamedTuple):
