@@ -1,9 +1,9 @@
 """Golden files: expected values of a few episodes of each world and of each built-in method.
 
-A version of a world or method changes with these values, not with the code. Each world's file holds
-values of its model, of two simulated episodes (one of full length), and the first observations of
-its environment; each method's file holds scores and estimates in two short episodes and in one of
-full length. Tolerances allow for differences between processors and BLAS kernels.
+A version of a world or method changes with these values, not with the code. A world's file holds
+values of its model, of two simulated episodes, and its environment's first observations; a method's
+file holds scores and estimates in two short episodes and in one of full length. Tolerances allow
+for differences between processors and BLAS kernels.
 """
 
 from __future__ import annotations
@@ -39,16 +39,11 @@ FIRST_STEPS = 24
 WORLD_EPISODES = {"train:0": FIRST_STEPS, "dev:0": None}
 """Seed -> number of simulated steps of a world's golden episode; None: the whole episode."""
 OBSERVATION_SEEDS = ("train:0", "dev:0", "dev:1")
-FAST_EPISODES = ("train:0",)
+QUICK_SEEDS = ("train:0",)
 """Seed of the only episode that a quick check computes: the shortened one."""
 SHORT_KWARGS = {"world": {"schedule": {"scored_steps": 4}}}
 """Arguments of a short episode of any environment."""
-N_OBSERVATIONS = 3
-"""Number of observations for each of these seeds: one from `reset` and two from `step`."""
-N_ENTRIES = 5
-"""Number of an estimate's nodes that a golden file holds."""
-RTOL_FLOAT64 = 1e-6
-RTOL_FLOAT32 = 1e-4
+RTOL_FLOAT64, RTOL_FLOAT32 = 1e-6, 1e-4
 """Relative tolerances. The reduced filter and stored load vectors are in single precision."""
 
 
@@ -89,7 +84,7 @@ def check(name: str, *, is_quick: bool = False) -> list[str]:
     if expected is None:
         return [f"{name} has no golden file: {golden_path(name)} is missing"]
     if is_quick and name in tracks.builtin_ids():
-        expected |= {part: {seed: expected[part][seed] for seed in FAST_EPISODES}
+        expected |= {part: {seed: expected[part][seed] for seed in QUICK_SEEDS}
                      for part in ("episodes", "observations")}
     elif is_quick:
         expected["episodes"] = expected["episodes"][:1]
@@ -98,17 +93,11 @@ def check(name: str, *, is_quick: bool = False) -> list[str]:
 
 def update(names: list[str], *, new_version: bool = False) -> Iterator[tuple[str, str, list[str]]]:
     """Compare built-in ids and methods (default: all) with their golden files, and write missing
-    files.
+    files. Yield name, status (``new``, ``same``, ``moved``, or the new version) and differences.
 
     With ``new_version``, a method's file whose numbers differ is rewritten with the next version
-    number; otherwise it is not changed. A world's file is never changed.
-
-    Yields
-    ------
-    name, status, differences
-        ``status`` is ``new``, ``same``, ``moved``, or the new version.
-
-    ``ValueError`` if a name is neither a built-in id nor a built-in method.
+    number. A world's file is never changed. ``ValueError`` if a name is neither a built-in id nor a
+    built-in method.
     """
     known = [*tracks.builtin_ids(), *golden_methods()]
     for name in names:
@@ -130,7 +119,7 @@ def update(names: list[str], *, new_version: bool = False) -> Iterator[tuple[str
             computed["version"] += 1
             status = f"v{computed['version']}"
         if status != "moved" and computed != expected:
-            write_atomically(golden_path(name), to_json(computed).encode())
+            write_atomically(golden_path(name), f"{json.dumps(computed, indent=1)}\n".encode())
             methods.golden_version.cache_clear()
         yield name, status, moved
 
@@ -156,18 +145,10 @@ def _differences(name: str, computed: dict[str, Any], expected: dict[str, Any]) 
     return found
 
 
-def to_json(numbers: dict[str, Any]) -> str:
-    """Format a golden file: one line for each number."""
-    return json.dumps(numbers, indent=1) + "\n"
-
-
 def differences(computed: Any, expected: Any, tolerance: float = RTOL_FLOAT64,
                 place: str = "") -> list[str]:
-    """Describe each number of two golden files that differs by more than the tolerance.
-
-    Both arguments are decoded JSON. A difference is relative to the largest number of its list;
-    observations of a world have the tolerance `RTOL_FLOAT32`.
-    """
+    """Describe each number of two golden files, decoded JSON, that differs by more than the
+    tolerance relative to the largest number of its list; for observations it is `RTOL_FLOAT32`."""
     if isinstance(computed, dict) and isinstance(expected, dict):
         if computed.keys() != expected.keys():
             others = ", ".join(sorted(computed.keys() ^ expected.keys()))
@@ -199,24 +180,18 @@ def _is_numeric(value: Any) -> bool:
 
 def world_golden(id: str, *, is_quick: bool = False) -> dict[str, Any]:
     """Compute the golden numbers of a registered id: of its world, and its first observations."""
-    episodes, seeds = (FAST_EPISODES, FAST_EPISODES) if is_quick else ((*WORLD_EPISODES,),
-                                                                   OBSERVATION_SEEDS)
+    episodes = QUICK_SEEDS if is_quick else tuple(WORLD_EPISODES)
+    seeds = QUICK_SEEDS if is_quick else OBSERVATION_SEEDS
     return {"id": id, **world_numbers(entry(id).world, episodes),
             "observations": {seed: first_observations(id, seed) for seed in seeds}}
 
 
 @lru_cache(maxsize=2)
 def world_numbers(world: World, episodes: tuple[str, ...]) -> dict[str, Any]:
-    """Compute numbers of a world's model and of its golden episodes.
-
-    Returns
-    -------
-    dict
-        JSON-ready: ``model`` (computed voltages in V, a transport step in mol/m³), and for each of
-        ``episodes`` some entries of 𝓡 in Ω, noise draws, voltages in V, load vectors b_t,
-        ∫(c − background)², ∫c², load vectors of the velocity, faults, ĉ_bh in mol/m³, and the mean
-        relative error of that estimate.
-    """
+    """Compute numbers of a world: ``model`` (computed voltages in V, a transport step in mol/m³),
+    and for each of ``episodes`` some entries of 𝓡 in Ω, noise draws, voltages in V, load vectors
+    b_t, ∫(c − background)², ∫c², load vectors of the velocity, faults, ĉ_bh in mol/m³, and the mean
+    relative error of that estimate."""
     return {"model": _model_numbers(world.truth_config),
             "episodes": {name: _episode_numbers(world, name) for name in episodes}}
 
@@ -293,12 +268,13 @@ def _episode_numbers(world: World, name: str) -> dict[str, Any]:
 
 
 def first_observations(id: str, name: str) -> dict[str, Any]:
-    """Return some entries of the first observations of an environment, and the rewards."""
+    """Return some entries of the first observations of an environment, one from `reset` and two
+    from `step`, and the rewards."""
     env = gym.make(id)
     observation, _ = env.reset(seed=parse_seeds(name)[0])
     numbers: dict[str, Any] = {"0": _observation_sample(observation)}
     rewards = []
-    for k in range(1, N_OBSERVATIONS):
+    for k in (1, 2):
         observation, reward, _, _, _ = env.step(_fixed_action(env, k))
         numbers[str(k)] = _observation_sample(observation)
         rewards.append(float(reward))
@@ -326,17 +302,14 @@ def _fixed_action(env: gym.Env, k: int) -> Any:
 
 
 def _new_golden(name: str, method: str) -> dict[str, Any]:
-    """Return a method's golden file without numbers: episodes of the first environment with which
-    it is compatible; ``ValueError`` without one."""
-    for id in tracks.builtin_ids():
-        if _can_play(method, id):
-            return {"method": name, "version": 1, "tolerance": RTOL_FLOAT64, "episodes": [
-                {"environment": id, "kwargs": kwargs, "seed": seed} for kwargs, seed in (
-                    (SHORT_KWARGS, "dev:0"), (SHORT_KWARGS, "dev:1"), ({}, "dev:0"))]}
-    raise ValueError(f"method {name} must be compatible with a built-in environment")
+    """Return a method's golden file without numbers: episodes of its first environment."""
+    id = next(id for id in tracks.builtin_ids() if _is_compatible(method, id))
+    return {"method": name, "version": 1, "tolerance": RTOL_FLOAT64, "episodes": [
+        {"environment": id, "kwargs": kwargs, "seed": seed} for kwargs, seed in (
+            (SHORT_KWARGS, "dev:0"), (SHORT_KWARGS, "dev:1"), ({}, "dev:0"))]}
 
 
-def _can_play(method: str, id: str) -> bool:
+def _is_compatible(method: str, id: str) -> bool:
     asked = tracks.Environment(id, json.dumps(SHORT_KWARGS))
     if is_path(method):
         return Path(method).parents[2].name == id.replace("/", "-")
@@ -368,5 +341,5 @@ def _answer(played: runner.EpisodeRun) -> dict[str, Any]:
                                for step in played.currents]}
     means = played.fields["mean"].astype(float)
     states = means[np.isfinite(means).all(axis=1)]
-    nodes = np.linspace(0, means.shape[1] - 1, N_ENTRIES + 2).astype(int)[1:-1]
+    nodes = np.linspace(0, means.shape[1] - 1, 7).astype(int)[1:-1]         # five inner ones
     return {"mean": states[:, nodes].mean(axis=0).tolist(), "last": states[-1, nodes].tolist()}

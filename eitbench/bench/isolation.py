@@ -18,7 +18,6 @@ import os
 import re
 import shutil
 import signal
-import socket
 import struct
 import subprocess
 import sys
@@ -50,7 +49,6 @@ from eitbench.worlds.task import Estimate
 
 ISOLATE = ("auto", "none", "process", "bubblewrap")
 """Values of the option ``isolate``."""
-REPLY_TIMEOUT_S = 600.0
 CHECK_INTERVAL_S = 0.2
 """time between two checks of a worker's memory and number of threads"""
 MAX_HEADER_BYTES = 1 << 20
@@ -58,8 +56,6 @@ MAX_ARRAY_BYTES = 1 << 28
 MAX_OUTPUT_CHARS = 10_000
 """limit of the printed text that is shown for one reply"""
 MAX_TEXT_CHARS = 2000
-METHOD_NAME = re.compile(r"[^./\\][^/\\]{0,99}")
-TITLE = re.compile(f".{{1,{methods.MAX_TITLE_CHARS}}}")
 NUMERIC_ENV = ("OPENBLAS_", "MKL_", "OMP_", "NPY_", "NUMBA_CPU")
 """Prefixes of environment variables that change the last bits of results."""
 ETC = ("alternatives", "group", "ld.so.cache", "localtime", "nsswitch.conf", "passwd")
@@ -240,15 +236,13 @@ def load_isolated(track: str, id: str, kwargs: str, method: str, isolation: str)
     """
     path = methods.find_method(method, track)
     sha256 = method_sha256(methods.method_files(path))
-    loaded = _load(track, id, kwargs, method, isolation, path, sha256)
-    if loaded.privileged:
-        raise ValueError(f"{path} is privileged: it needs the ground truth")
-    return loaded
+    return _load(track, id, kwargs, method, isolation, path, sha256)
 
 
 def peak_memory() -> int | None:
     """Return the peak memory in bytes of a process of the current worker; None if unknown."""
-    return next((worker.peak_memory for worker in _started), None)
+    family = [pid for worker in _started for pid in worker._family()]
+    return max((_status(pid, "VmHWM") for pid in family), default=0) or None
 
 
 def close() -> None:
@@ -277,32 +271,38 @@ def _load(track: str, id: str, kwargs: str, method: str, isolation: str, path: P
     about = worker.about
     # a worker may report any name
     name: Any = path.stem if path.suffix == ".py" else about.get("name")
-    for key, value, limit in (("name", name, METHOD_NAME), ("title", about.get("title"), TITLE)):
-        if not isinstance(value, str) or not limit.fullmatch(value) or sanitize(value) != value:
+    title = f".{{1,{methods.MAX_TITLE_CHARS}}}"
+    for key, value, pattern in (("name", name, r"[^./\\][^/\\]{0,99}"),
+                                ("title", about.get("title"), title)):
+        if (not isinstance(value, str) or not re.fullmatch(pattern, value)
+                or sanitize(value) != value):
             raise ValueError(f"{path} reports an invalid {key}")
     built_in = methods.builtin_files(id).get(name)
     if built_in is not None and methods.builtin_sha256(built_in) != worker.sha256:
         raise ValueError(f"{path} has the name of a built-in method, {name}, under which "
                          "results are stored; rename it")
-    return methods.method_from_attributes(track, name, str(path), worker, about)._replace(
-        title=about["title"], path=path, sha256=worker.sha256)
+    loaded = methods.method_from_attributes(track, name, str(path), worker, about)
+    if loaded.privileged:
+        raise ValueError(f"{path} is privileged: it needs the ground truth")
+    return loaded._replace(title=about["title"], path=path, sha256=worker.sha256)
 
 
 class Worker:
     """A process that runs one estimator or policy in one environment, episode after episode.
 
     ``method`` is the name of a built-in method, or the path of a file. The content of the file is
-    read once and sent to the process, which makes a separate environment. A reply may take
-    ``reply_timeout`` seconds. Calls raise `WorkerError` if the method fails, and ``ValueError`` if
-    a process under bubblewrap could read the cache folder.
+    read once and sent to the process, which makes a separate environment. Calls raise `WorkerError`
+    if the method fails, and ``ValueError`` if a process under bubblewrap could read the cache
+    folder.
     """
 
+    reply_timeout = 600.0
+    """s, longest time of a reply"""
+
     def __init__(self, track: str, id: str, kwargs: dict[str, Any], method: str,
-                 isolation: str = "bubblewrap", *, limits: Limits | None = None,
-                 reply_timeout: float = REPLY_TIMEOUT_S) -> None:
-        self.reply_timeout = reply_timeout
+                 isolation: str = "bubblewrap", *, limits: Limits | None = None) -> None:
         self.sha256 = ""
-        """hash of the method's file; empty for a built-in method"""
+        """hash of the files that are sent; empty for a built-in method"""
         self.about: dict[str, Any] = {}
         """Unchecked attributes that the method's class reports."""
         self.suits: Callable[[Any], bool] = lambda _: bool(self.about.get("suits"))
@@ -314,8 +314,7 @@ class Worker:
         self._request = {"track": track, "id": id, "kwargs": kwargs, **self._files(id, method)}
 
     def start(self) -> None:
-        """Unless the process runs, start one that loads the method, in place of the process of the
-        current worker."""
+        """Unless it runs, start the process, in place of the process of the current worker."""
         if self.is_alive:
             return
         close()
@@ -330,12 +329,9 @@ class Worker:
             command = [*bubblewrap(self._limits, files), *command]
         self._folder = tempfile.TemporaryDirectory(prefix="eitbench-", ignore_cleanup_errors=True)
         self._home = Path("/tmp" if self._is_confined else self._folder.name)
-        ours, theirs = socket.socketpair()
-        with ours, theirs:
-            self._stream = ours.makefile("rwb")
-            self._process = subprocess.Popen(
-                command, stdin=theirs.fileno(), stdout=theirs.fileno(), stderr=subprocess.DEVNULL,
-                start_new_session=True, env=self._environment(), cwd=Path.cwd())
+        self._process = subprocess.Popen(
+            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL,
+            start_new_session=True, env=self._environment())
         _started.append(self)
         self._exceeded = ""
         threading.Thread(target=self._watch, args=(self._process,), daemon=True).start()
@@ -367,17 +363,13 @@ class Worker:
         """True if the process runs; it ends after a crash, a limit or a malformed message."""
         return self._process is not None and self._process.poll() is None
 
-    @property
-    def peak_memory(self) -> int | None:
-        """Peak memory in bytes of one of its processes; None where /proc does not report it."""
-        return max((_status(pid, "VmHWM") for pid in self._family()), default=0) or None
-
     def close(self) -> None:
         """End the process and its children, and remove its folder."""
         if self._process is not None:
             _kill(self._process)
             with suppress(OSError):  # data that it has not read
-                self._stream.close()
+                self._process.stdin.close()
+            self._process.stdout.close()
             self._folder.cleanup()
 
     def _environment(self) -> dict[str, str]:
@@ -409,13 +401,13 @@ class Worker:
                                      for name, content in contents.items()}
 
     def _ask(self, do: str, **content: Any) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-        """Send a request with the arguments of one of the methods of `_MethodServer`, and return
-        the values and arrays of the reply."""
+        """Send a request with the arguments of a method of `_MethodServer`, print the output of the
+        worker's method, and return the values and arrays of the reply."""
         self._deadline = time.monotonic() + self.reply_timeout
         try:
-            self._stream.write(encode_message({"do": do, **content}))
-            self._stream.flush()
-            reply, arrays = decode_message(partial(_read_exactly, self._stream))
+            self._process.stdin.write(encode_message({"do": do, **content}))
+            self._process.stdin.flush()
+            reply, arrays = decode_message(partial(_read_exactly, self._process.stdout))
         except (EOFError, ConnectionError):
             with suppress(subprocess.TimeoutExpired):
                 self._process.wait(1.0)
@@ -431,7 +423,9 @@ class Worker:
             raise
         finally:
             self._deadline = math.inf
-        self._show(str(reply.pop("printed", ""))[:MAX_OUTPUT_CHARS].rstrip("\n"))
+        if printed := str(reply.pop("printed", ""))[:MAX_OUTPUT_CHARS].rstrip("\n"):
+            lines = sanitize(printed, lines=True).replace("\n", f"\n[{self._name}] ")
+            sys.stderr.write(f"[{self._name}] {lines}\n")
         if "error" in reply:
             message, where, traceback = (str(reply.get(name))[:MAX_TEXT_CHARS]
                                          for name in ("error", "where", "traceback"))
@@ -439,12 +433,6 @@ class Worker:
             failed.where, failed.traceback = where, traceback
             raise failed
         return reply, arrays
-
-    def _show(self, printed: str) -> None:
-        """Print the method's output, each line prefixed with its name."""
-        if printed:
-            lines = sanitize(printed, lines=True).replace("\n", f"\n[{self._name}] ")
-            sys.stderr.write(f"[{self._name}] {lines}\n")
 
     def _watch(self, process: subprocess.Popen[bytes]) -> None:
         """Kill the process after the deadline of a reply, or when it and its children have too much
@@ -468,8 +456,7 @@ class Worker:
             _kill(process)
 
     def _family(self) -> list[int]:
-        """Return the ids of the process and its descendants; stop soon after the limit is
-        exceeded."""
+        """Return the ids of the process and its descendants, not many more than the limit."""
         found: list[int] = []
         left = [self._process.pid]
         while left and len(found) <= self._limits.threads:

@@ -29,13 +29,10 @@ LOADER_GROUP = "eitbench.loaders"
 the file's suffix and is called with path and content."""
 ROLES = (None, "floor", "reference")
 """Role of a method on a leaderboard: ranked, naive baseline, or oracle."""
-
 AGENT_FILES = ("config.json", "sha256")
 """Files in the folder of an agent's model.zip."""
 MAX_METHOD_BYTES = 1 << 28
-"""size of a method's file"""
 MAX_TITLE_CHARS = 120
-"""length of a title"""
 MAX_PARAMETERS_BYTES = 10_000
 """size of a method's parameters as JSON in a record"""
 AGENTS_NOT_BUNDLED = ("checkpoints of built-in agents are in a checkout only, not in an installed "
@@ -69,8 +66,7 @@ class Method(NamedTuple):
     name: str
     """Name of the file without its suffix; for an agent, algorithm and training seed."""
     title: str
-    """First line of its docstring, up to a colon, bracket or full stop, and at most
-    `MAX_TITLE_CHARS` characters; without a docstring the file's name."""
+    """See `title_of`."""
     path: Path
     sha256: str
     subtracks: tuple[str, ...]
@@ -91,10 +87,9 @@ class Method(NamedTuple):
         return version_of(self.path, self.sha256)
 
     def suits(self, world: Any) -> bool:
-        """Return whether it is compatible with a `Task` of its subtracks, or with `Rules`; a method
-        without a function ``suits`` is compatible with all."""
-        suits = getattr(self.make, "suits", None)
-        return suits is None or bool(suits(world))
+        """Return whether it is compatible with a `Task` of its subtracks, or with `Rules`, as its
+        optional function ``suits`` determines."""
+        return bool(getattr(self.make, "suits", lambda _: True)(world))
 
 
 def baseline_folder() -> Path:
@@ -214,13 +209,12 @@ def method_files(path: Path) -> dict[str, bytes]:
     names in ``files = ("weights.npz",)``, or that `eitbench.rl.save_agent` writes with a model.
 
     The source is parsed, not executed. ``ValueError`` if a named file is not in the folder."""
-    source = _content(path)
+    contents = {path.name: _content(path)}
     if path.suffix != ".py":
-        return {path.name: source} | {name: path.with_name(name).read_bytes()
-                                      for name in AGENT_FILES if path.with_name(name).is_file()}
-    contents = {path.name: source}
+        return contents | {name: path.with_name(name).read_bytes()
+                           for name in AGENT_FILES if path.with_name(name).is_file()}
     try:
-        names = _class_attribute(source, "files", ())
+        names = _class_attribute(contents[path.name], "files", ())
     except SyntaxError:             # loading reports the error
         names = ()
     except ValueError:              # not a literal
@@ -259,7 +253,8 @@ def builtin_summary(name: str, track: str) -> tuple[str, tuple[str, ...]]:
 
 
 def title_of(docstring: str | None, name: str) -> str:
-    """Return the title in a method's docstring, see `Method`; its name without one."""
+    """Return the title in a method's docstring: its first line up to a colon or full stop, at most
+    `MAX_TITLE_CHARS` characters; the method's name without one."""
     paragraph = " ".join((docstring or "").strip().split("\n\n")[0].split())
     return re.split(r"[.:](?:\s|$)", paragraph)[0][:MAX_TITLE_CHARS].strip() or name
 
@@ -344,10 +339,9 @@ def method_from_attributes(track: str, name: str, who: str, make: Callable[..., 
             or any(each not in SUBTRACKS[track] for each in subtracks)):
         raise ValueError(f"{who}.subtracks must be some of {', '.join(SUBTRACKS[track])}, got "
                          f"{subtracks!r}")
-    role = given.get("role")
+    role, privileged = given.get("role"), given.get("privileged", False)
     if role not in ROLES:
         raise ValueError(f"{who}.role must be among {', '.join(map(repr, ROLES))}; got {role!r}")
-    privileged = given.get("privileged", False)
     if not isinstance(privileged, bool):
         raise ValueError(f"{who}.privileged must be True or False, got {privileged!r}")
     parameters = given.get("parameters", {})
@@ -359,8 +353,7 @@ def method_from_attributes(track: str, name: str, who: str, make: Callable[..., 
 
 
 def load_module(kind: str, path: Path, source: bytes) -> ModuleType:
-    """Execute a file's content as a module; ``ValueError``, naming ``kind`` and path, if that
-    fails."""
+    """Execute a file's content as a module; ``ValueError``, naming kind and path, if it fails."""
     name = f"eitbench_{kind}_{path.stem}"
     specification = importlib.util.spec_from_file_location(name, path)
     assert specification is not None

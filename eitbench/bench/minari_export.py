@@ -36,10 +36,7 @@ Simulated by eitbench {version}; no measured data, no personal data. Licence: MI
 
 def export_minari(name: str, env: str, policy: str, seeds: str | Sequence[int], *,
                   n_jobs: int = 1, backend: str = "loky") -> int:
-    """Run a policy, write its episodes to Minari's data folder, and return their number.
-
-    All episodes are written at the end: an interrupted export leaves only cached simulated
-    episodes, and must be started again.
+    """Run a policy, write its episodes at the end to Minari's data folder, and return their number.
 
     ``name`` is the name of the data set, e.g. ``eitbench/pipe2d/random-pair-v0``; ``env`` the id of
     an injection environment; ``policy`` a built-in name, or the path of a file, which runs in this
@@ -92,14 +89,12 @@ def _run(env: gym.Env[Any, Any], policy: Method, seed: int, number: int) -> Epis
         observations = [env.reset(seed=seed)[0]]
     player = policy.make(inner.rules, policy_generator(seed), *[inner.core] * policy.privileged)
     steps: list[tuple[Any, ...]] = []
-    ended = False
-    while not ended:
+    while not steps or not any(steps[-1][2:]):                  # terminated or truncated
         raw = {name: array[0] for name, array in inner.core.observe().items()}
         action = player.act(raw)
-        observation, reward, terminated, truncated, _ = env.step(action)
+        observation, *rest, _ = env.step(action)
         observations.append(observation)
-        steps.append((action, reward, terminated, truncated))
-        ended = terminated or truncated
+        steps.append((action, *rest))
     columns = map(np.array, zip(*steps, strict=True))  # in the buffer's order
     return EpisodeBuffer(number, seed, None, np.array(observations), *columns, infos={})
 

@@ -46,8 +46,8 @@ class EpisodeRun(NamedTuple):
     currents: np.ndarray
     """(steps, L) A (A/m in 2D), injected currents of each step"""
     fields: dict[str, np.ndarray]
-    """Means and standard deviations of an estimator's estimates as float32, for figures; empty for
-    policies and on measurements."""
+    """Means and standard deviations of estimates as float32, for figures; empty for policies and on
+    measurements."""
     actions: list[Any] | None = None
     """actions of a policy, JSON-ready"""
     episode_return: float | None = None
@@ -100,13 +100,10 @@ def run_on_measurements(env: MeasuredEnv, method: str | Method, seed: int = 0, *
     """
     if isinstance(method, str):
         method = load_method(method, "estimation")
-    if "filter" not in method.subtracks:
-        raise ValueError("method must estimate the present state, as in filtering, got "
-                         f"{method.name} for {', '.join(method.subtracks)}")
     env.reset(seed=seed)                            # sets the task before the time measurement
-    if not method.suits(env.task):
-        raise ValueError("method must suit vessel, flow and target of the measurements, got "
-                         f"{method.name}")
+    if "filter" not in method.subtracks or not method.suits(env.task):
+        raise ValueError("method must be a filter and must suit vessel, flow and target of the "
+                         f"measurements, got {method.name} for {', '.join(method.subtracks)}")
     with threadpool_limits(1):
         steps = tqdm(_iter_steps(env, method, seed), total=env.episode_steps, desc=method.name,
                      unit="measurement", disable=None, leave=False)
@@ -187,8 +184,8 @@ class EstimatorOutput:
         steps = range(task.warm_up + 1, task.n_steps + 1)
         innovations = None
         if all(i in self.innovations for i in steps):
-            innovations = (np.array([self.innovations[i][0] for i in steps]),
-                           np.array([self.innovations[i][1] for i in steps]))
+            vectors, covariances = zip(*(self.innovations[i] for i in steps), strict=True)
+            innovations = np.array(vectors), np.array(covariances)
         return Outcome(
             env.world, sum(self.seconds) / task.n_steps, scoring.step_errors(mean, truth, mass),
             mean=mean, truth=truth, mass=mass,
@@ -201,33 +198,29 @@ class EstimatorOutput:
 def _solute_flow(env: EstimationEnv, states: np.ndarray, means: np.ndarray,
                  velocities: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
     """Return the estimated and the true flow of solute through the outlet (S,) in mol/s, for the
-    true ``states`` (S, n_truth) that are scored, their estimates (S, n) and flow parameters (S, k);
-    None without a flow through the vessel.
-    """
+    scored ``states`` (S, n_truth), their estimates (S, n) and flow parameters (S, k); None without
+    a flow through the vessel."""
     task, world = env.task, env.world
     model, truth = task.transport, cached_truth_model(world).transport
     if not (isinstance(model, ConvectionDiffusion) and isinstance(truth, ConvectionDiffusion)
             and model.inlet.size):
         return None
     drawn = world.flow.draw(world, episode_streams(env.core.seeds[0]).flow)
-    outlet = outlet_of(model)
+    outlet, true_outlet = outlet_of(model), outlet_of(truth)
     estimated = [outlet.solute_flow(mean, task.velocity.field(parameters) if task.velocity
                                     else model.velocity)
                  for mean, parameters in zip(means, velocities, strict=True)]
-    outlet = outlet_of(truth)
-    first = task.warm_up + 1
-    true = [outlet.solute_flow(concentration, drawn(t) if drawn else truth.velocity)
-            for t, concentration in enumerate(states, first)]
+    true = [true_outlet.solute_flow(concentration, drawn(t) if drawn else truth.velocity)
+            for t, concentration in enumerate(states, task.warm_up + 1)]
     return np.array(estimated), np.array(true)
 
 
 def _run_policy(env: InjectionEnv, policy: Method, seed: int) -> EpisodeRun:
-    seconds = 0.0
+    seconds = total = 0.0
     currents = list[np.ndarray]()
     actions = list[Any]()
     scored = list[tuple[Any, ...]]()
     # `iter_injections` does not measure the time of this loop's body
-    total = 0.0
     for t, observation, elapsed, action, reward in iter_injections(env, policy, seed):
         seconds += elapsed
         total += reward
@@ -253,8 +246,7 @@ def _run_policy(env: InjectionEnv, policy: Method, seed: int) -> EpisodeRun:
         n_injections=sum(bool(each.any()) for each in currents),
         mean=(interpolation @ np.array(mean).T).T, std=(interpolation @ np.array(std).T).T,
         truth=simulate(world, seed, progress=False).concentration[list(states)].astype(float),
-        mass=mass, points=truth_mesh(world).points, distances=distances,
-        ospa=ospa,
+        mass=mass, points=truth_mesh(world).points, distances=distances, ospa=ospa,
         innovations=([each.value for each in used],
                      [each.covariance for each in used]) if used else None)
     return EpisodeRun(outcome, np.array(currents), {}, actions, total)
@@ -311,7 +303,7 @@ def _iter_steps(env: EstimationEnv | MeasuredEnv, estimator: Method, seed: int,
     begin = time.perf_counter()
     player = estimator.make(*shown)
     setup = time.perf_counter() - begin
-    silence = np.full(env.task.mesh.n_nodes, env.task.expected_concentration)
+    silence = Estimate(np.full(env.task.mesh.n_nodes, env.task.expected_concentration))
     t = -env.task.lag
     done = False
     while not done:
@@ -328,17 +320,17 @@ def _iter_steps(env: EstimationEnv | MeasuredEnv, estimator: Method, seed: int,
             _check_estimate(estimate, env.task, np.isfinite(seen["voltages"]))
             if estimate.variance is not None and isinstance(env, EstimationEnv):
                 env.core.estimate_std = np.sqrt(estimate.variance)
-        observation, _, done, _, _ = env.step(_action(env.task, estimate, silence))
+        observation, _, done, _, _ = env.step(
+            _action(env.task, silence if estimate is None else estimate))
         yield t, estimate, seen, seconds
 
 
-def _action(task: Task, estimate: Estimate | None, silence: np.ndarray) -> np.ndarray:
-    """Return the environment's action; the flow is nominal if the estimator returns none."""
-    mean = silence if estimate is None else estimate.mean
+def _action(task: Task, estimate: Estimate) -> np.ndarray:
+    """Return the environment's action; the flow is nominal if the estimate has none."""
     if task.velocity is None:
-        return mean
-    velocity = None if estimate is None else estimate.velocity
-    return np.concatenate([mean, task.velocity.nominal if velocity is None else velocity])
+        return estimate.mean
+    flow = task.velocity.nominal if estimate.velocity is None else estimate.velocity
+    return np.concatenate([estimate.mean, flow])
 
 
 def _check_estimate(estimate: Any, task: Task, measured: np.ndarray) -> None:

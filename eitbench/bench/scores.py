@@ -5,9 +5,9 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import lru_cache, wraps
+from functools import lru_cache
 from importlib.metadata import entry_points
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 
@@ -79,25 +79,6 @@ class Outcome:
         return np.asarray(self.mass.sum(axis=0)).ravel()
 
 
-_OLD_KEYWORDS = {"of": "compute", "better": "direction", "needs": "requires",
-                 "repeats": "deterministic"}
-_Class = TypeVar("_Class")
-
-
-def _accept_old_keywords(cls: type[_Class]) -> type[_Class]:
-    """Let packages that register scores pass the former names of the fields."""
-    initialise = cls.__init__
-
-    @wraps(initialise)
-    def __init__(self: Any, *args: Any, **fields: Any) -> None:
-        initialise(self, *args, **{_OLD_KEYWORDS.get(name, name): value
-                                   for name, value in fields.items()})
-
-    cls.__init__ = __init__  # type: ignore[method-assign]
-    return cls
-
-
-@_accept_old_keywords
 @dataclass(frozen=True)
 class Score:
     """A number computed from each episode; ``ValueError`` if a field is invalid."""
@@ -125,10 +106,10 @@ class Score:
             raise ValueError("name must be of lower-case letters, digits and underscores, got "
                              f"{self.name!r}")
         _check.choice("direction", self.direction, SCORE_DIRECTIONS)
-        for argument, values, allowed in (("requires", self.requires, Outcome.__dataclass_fields__),
-                                          ("tracks", self.tracks, KINDS)):
-            for each in values:
-                _check.choice(f"each of {argument}", each, allowed)
+        for each in self.requires:
+            _check.choice("each of requires", each, Outcome.__dataclass_fields__)
+        for each in self.tracks:
+            _check.choice("each of tracks", each, KINDS)
         _check.number("factor", self.factor, low=0.0, open_low=True)
 
     def __call__(self, outcome: Outcome) -> float | None:
@@ -147,8 +128,7 @@ _scores: dict[str, Score] = {}
 
 
 def register_score(score: Score) -> Score:
-    """Add a score to all episodes that run from now on. ``ValueError`` if its name or heading is in
-    use."""
+    """Add a score to all episodes from now on; ``ValueError`` if its name or heading is in use."""
     for other in _scores.values():
         if other.name == score.name or other.heading == score.heading:
             raise ValueError(f"score {score.name} ({score.heading}) has the name or heading of "

@@ -34,33 +34,28 @@ from eitbench.bench.records import (
     write_record,
 )
 from eitbench.bench.scores import SCORING
-from eitbench.data import cache
+from eitbench.data.cache import SIMULATION
 from eitbench.data.seeds import format_seed
 
 PACKAGES = ("eitbench", "numpy", "scipy", "gymnasium", "scikit-fem", "numba", "stable-baselines3",
             "sb3-contrib", "torch")
 """Packages whose versions are part of a record."""
+DECLARED_VERSIONS = {"simulation": str(SIMULATION), "scoring": str(SCORING)}
+"""Version numbers that developers raise when a change of the code changes scores of an episode."""
 _OPTION = re.compile(r"^(--?[\w-]+=|-[a-z])")
 """Name of an option that is joined to its value."""
 
 
 class EpisodeStore:
     """Episode results of a run in a folder: ``episodes/ENV/METHOD/SEED.json``, with the estimates
-    in ``SEED.npz``.
-
-    A result is a dictionary: the scores of one method in one episode, with environment, versions
-    and status ("ok" or a failure). Files are written atomically, so several runs may share a folder
-    and may be interrupted at any time.
-    """
+    in ``SEED.npz``. Files are written atomically, so several runs may share a folder and may be
+    interrupted at any time."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = Path(folder).absolute()           # workers may have other working folders
 
     def put(self, result: dict[str, Any], fields: dict[str, np.ndarray]) -> None:
-        """Store the ``result`` and the estimates ``fields`` of one episode.
-
-        The estimates are written first, so that each stored result has its estimates.
-        """
+        """Store the ``result`` of one episode, and before it the estimates ``fields``."""
         path = self._path(result["environment"]["name"], result["method"], result["seed"])
         if fields:
             content = io.BytesIO()
@@ -70,11 +65,10 @@ class EpisodeStore:
 
     def has_result(self, environment: str, method: str, seed: int, identity: str) -> bool:
         """Return whether a successful result with the cache key ``identity`` is stored."""
-        try:
+        with suppress(ValueError):
             result = self.result(environment, method, seed)
-        except ValueError:
-            return False
-        return result["identity"] == identity and result["status"] == "ok"
+            return bool(result["identity"] == identity and result["status"] == "ok")
+        return False
 
     def result(self, environment: str, method: str, seed: int) -> dict[str, Any]:
         """Return a stored result; ``ValueError`` if it is missing or damaged."""
@@ -98,11 +92,8 @@ class EpisodeStore:
 
     def fields(self, result: dict[str, Any]) -> dict[str, np.ndarray]:
         """Read the estimates of a result: ``mean`` and optionally ``std``, (T, n) in mol/m³ for T
-        states and n nodes.
-
-        ``std`` is NaN in states for which the method reported no variance. ``FileNotFoundError`` if
-        the file of estimates is missing; ``ValueError``, naming the file, if it is damaged.
-        """
+        states and n nodes; ``std`` is NaN in states without a variance. ``FileNotFoundError`` if
+        the file is missing; ``ValueError``, naming it, if it is damaged."""
         path = self._path(result["environment"]["name"], result["method"], result["seed"])
         path = path.with_suffix(".npz")
         try:
@@ -122,9 +113,9 @@ class EpisodeStore:
     def records(self, also: Iterable[dict[str, Any]] = ()) -> list[dict[str, Any]]:
         """Build one record per environment, method and split of the seeds, without validation.
 
-        Stored results are ignored if their method's file or `declared_versions` differ from the
-        most recent result. ``also`` are results of other records: if they have the same version of
-        the method, they replace missing and failed episodes.
+        Stored results are ignored if their method's file or `DECLARED_VERSIONS` differ from the
+        most recent result. ``also`` are results of other records, which replace missing and failed
+        episodes of the same version of the method.
         """
         own, others = _by_record(self.results()), _by_record(also)
         records = []
@@ -155,12 +146,10 @@ class EpisodeStore:
         return self.folder / "episodes" / environment.replace("/", "-") / method / name
 
 
-_Groups = dict[tuple[str, str, str], list[dict[str, Any]]]
-
-
-def _by_record(results: Iterable[dict[str, Any]]) -> _Groups:
+def _by_record(results: Iterable[dict[str, Any]],
+               ) -> dict[tuple[str, str, str], list[dict[str, Any]]]:
     """Group results by environment, method and split, as in records."""
-    groups: _Groups = {}
+    groups: dict[tuple[str, str, str], list[dict[str, Any]]] = {}
     for result in results:
         key = (result["environment"]["name"], result["method"], split_of(result["seed"]))
         groups.setdefault(key, []).append(result)
@@ -174,7 +163,7 @@ def _latest(results: list[dict[str, Any]]) -> dict[str, Any]:
 def _code(result: dict[str, Any]) -> tuple[Any, ...]:
     """Return the sha256 of the method's file, and the declared versions."""
     versions = result["run"]["versions"]
-    return result["method_sha256"], *map(versions.get, declared_versions())
+    return result["method_sha256"], *map(versions.get, DECLARED_VERSIONS)
 
 
 def _gathered(results: list[dict[str, Any]]) -> dict[str, Any]:
@@ -187,16 +176,17 @@ def _gathered(results: list[dict[str, Any]]) -> dict[str, Any]:
             chosen[result["seed"]] = result
     # sort 9 before 10
     results = sorted(chosen.values(), key=lambda result: (len(result["seed"]), result["seed"]))
-    texts = [json.dumps(result["run"], sort_keys=True) for result in results]
-    runs = dict(zip(texts, (result["run"] for result in results), strict=True))
-    place = {run: i for i, run in enumerate(runs)}
+    runs: list[dict[str, Any]] = []
+    for result in results:
+        if result["run"] not in runs:
+            runs.append(result["run"])
     return with_content_hash({
         "schema": SCHEMA, "official": False, "split": split_of(latest["seed"]),
         **{key: latest[key] for key in COMMON_FIELDS},
-        "seeds": [result["seed"] for result in results], "runs": list(runs.values()),
+        "seeds": [result["seed"] for result in results], "runs": runs,
         "episodes": [{key: value for key, value in result.items()
-                      if key not in (*COMMON_FIELDS, "traceback")} | {"run": place[run]}
-                     for result, run in zip(results, texts, strict=True)],
+                      if key not in (*COMMON_FIELDS, "traceback")}
+                     | {"run": runs.index(result["run"])} for result in results],
     })
 
 
@@ -227,12 +217,6 @@ def _read(path: Path) -> dict[str, Any]:
 # -- the code and the machine of a run ----------------------------------------------------------
 
 
-def declared_versions() -> dict[str, str]:
-    """Return the version numbers of simulation and scoring, which developers increase when a change
-    of the code changes scores of the same episode."""
-    return {"simulation": str(cache.SIMULATION), "scoring": str(SCORING)}
-
-
 @lru_cache(maxsize=1)
 def provenance() -> dict[str, Any]:
     """Return package versions, BLAS library, git commit, and whether the checkout has changes."""
@@ -242,7 +226,7 @@ def provenance() -> dict[str, Any]:
     blas = config["Build Dependencies"]["blas"]
     packages = {name: _version(name) for name in PACKAGES}
     return {
-        "versions": {"python": platform.python_version(), **packages, **declared_versions()},
+        "versions": {"python": platform.python_version(), **packages, **DECLARED_VERSIONS},
         "blas": f"{blas['name']} {blas['version']}",
         "commit": _git("rev-parse", "HEAD"), "dirty": None if status is None else bool(status),
     }
@@ -262,11 +246,10 @@ def _portable(word: str) -> str:
 
 @lru_cache(maxsize=1)
 def machine() -> dict[str, Any]:
-    """Return processor, number of cores, operating system and speed of the machine of this process,
-    in a cluster the machine of the worker.
+    """Return processor, number of cores, operating system and speed of the machine of this process.
 
-    The speed is the time in s of a product of two 1000 × 1000 matrices in double precision on one
-    thread (median of three). Computing times relative to it can be compared between machines.
+    The speed, which makes computing times comparable, is the time in s of a product of two 1000 ×
+    1000 matrices in double precision on one thread (median of three).
     """
     a, b = np.random.default_rng(0).normal(size=(2, 1000, 1000))
     with threadpool_limits(1):
@@ -276,27 +259,24 @@ def machine() -> dict[str, Any]:
 
 
 def _version(package: str) -> str | None:
-    try:
+    with suppress(PackageNotFoundError):
         return version(package)
-    except PackageNotFoundError:
-        return None
+    return None
 
 
 def _git(*arguments: str) -> str | None:
     checkout = PACKAGE.parent
     if not (checkout / ".git").exists():  # installed: an enclosing repository is unrelated
         return None
-    try:
+    with suppress(OSError, subprocess.SubprocessError):
         return subprocess.run(["git", *arguments], cwd=checkout, capture_output=True, text=True,
                               timeout=10, check=True).stdout.strip()
-    except (OSError, subprocess.SubprocessError):
-        return None
+    return None
 
 
 def _processor() -> str:
-    try:
+    with suppress(OSError):
         text = Path("/proc/cpuinfo").read_text(encoding="utf-8")
-    except OSError:
-        text = ""
-    named = re.search(r"^model name[^:\n]*:(.*)", text, re.MULTILINE)
-    return named[1].strip() if named else platform.processor() or platform.machine()
+        if named := re.search(r"^model name[^:\n]*:(.*)", text, re.MULTILINE):
+            return named[1].strip()
+    return platform.processor() or platform.machine()

@@ -13,7 +13,3 @@ def main() -> None:
     except ModuleNotFoundError as error:
         sys.exit(str(error))
     app()
-
-
-if __name__ == "__main__":
-    main()

@@ -78,8 +78,6 @@ Records = Annotated[Path, typer.Option(
     help="Folder of the records. If it is missing, the records of the package are used.",
     callback=resolve_path)]
 RECORDS = Path("leaderboards/results")
-METHODS = Path("leaderboards/methods")
-"""Folder of the files of submitted methods."""
 
 
 def parse_episodes(seeds: str | None) -> list[int] | None:

@@ -94,7 +94,7 @@ def copy(tmp_path, monkeypatch):
     content = golden.read_golden(PLAIN)
     monkeypatch.setattr(golden, "WORLD_FOLDER", tmp_path)
     monkeypatch.setattr(golden, "world_golden", lambda id, is_quick: content)
-    golden.golden_path(PLAIN).write_text(golden.to_json(content))
+    golden.golden_path(PLAIN).write_text(json.dumps(content))
     return golden.golden_path(PLAIN)
 
 

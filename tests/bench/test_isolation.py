@@ -340,8 +340,8 @@ def test_workers_end_with_their_parent(tmp_path):
     program = ("import json, time, numpy as np; from eitbench.bench import isolation\n"
                f"for kind, path in {paths!r}.items():\n"
                f"    there = isolation.Worker('estimation', {FILTER.id!r}, {json.loads(FILTER.kwargs)!r}, path, kind)\n"
-               "    there(None); isolation._started.clear(); there._stream.write(isolation.encode_message("
-               "{'do': 'update', 'voltages': np.zeros(4), 'currents': np.zeros(4)})); there._stream.flush()\n"
+               "    there(None); isolation._started.clear(); there._process.stdin.write(isolation.encode_message("
+               "{'do': 'update', 'voltages': np.zeros(4), 'currents': np.zeros(4)})); there._process.stdin.flush()\n"
                "    time.sleep(1.0); print(*there._family(), end=' ')\n"
                "print(flush=True); time.sleep(60)")
     with subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE, text=True) as host:
