@@ -301,24 +301,21 @@ def test_failures_end_the_worker(statement, message, tmp_path):
     assert re.search(message, said) and not is_alive
 
 
-@confined
-@pytest.mark.parametrize(("child", "limits", "message"), [
-    ("pass", Limits(threads=100), "ResourceLimitError: it started more than 100|RuntimeError: refused"),
-    ("kept = np.ones(2**25)", Limits(memory=2 << 30), "ResourceLimitError: it held more than 2048 MiB|MemoryError"),
-], ids=["processes", "memory of all processes"])
-def test_limits_hold_for_all_its_processes(child, limits, message, tmp_path):
-    """Processes are also counted by the parent, because the kernel does not count processes of root."""
-    said, _ = ask(write_baseline(tmp_path, update=FORK.format(child=child)), limits=limits)
-    assert re.search(message, said)
+FILL = "[open(f'{Path.home()}/{k}', 'wb').write(bytes(2**20)) for k in range(200)]; raise RuntimeError('wrote all')"
 
 
 @confined
-def test_disk_space_is_limited(tmp_path):
-    """The only writable folder is in memory and has a limited size."""
-    write = ("content = bytes(2**20)\n        for k in range(200):\n"
-             "            open(f'{Path.home()}/{k}', 'wb').write(content)\n        raise RuntimeError('wrote all')")
-    said, _ = ask(write_baseline(tmp_path, update=write), limits=Limits(disk=100 << 20))
-    assert "No space left" in said
+@pytest.mark.parametrize(("update", "limits", "message"), [
+    (FORK.format(child="pass"), Limits(threads=100),
+     "ResourceLimitError: it started more than 100|RuntimeError: refused"),
+    (FORK.format(child="kept = np.ones(2**25)"), Limits(memory=2 << 30),
+     "ResourceLimitError: it held more than 2048 MiB|MemoryError"),
+    (FILL, Limits(disk=100 << 20), "No space left"),
+], ids=["processes", "memory of all processes", "disk"])
+def test_limits_hold_for_all_its_processes(update, limits, message, tmp_path):
+    """Processes are also counted by the parent, because the kernel does not count processes of root. The only writable
+    folder is in memory and has a limited size."""
+    assert re.search(message, ask(write_baseline(tmp_path, update=update), limits=limits)[0])
 
 
 STUBBORN = """

@@ -1,6 +1,5 @@
 """Results on disk: atomic writes, concurrent writers, and records with all data for a rerun."""
 
-import json
 import math
 import platform
 import re
@@ -16,12 +15,11 @@ from eitbench.bench import store as store_module
 from eitbench.bench.run import Job, run_jobs
 from eitbench.bench.scores import SCORING
 from eitbench.bench.store import EpisodeStore, portable_command, provenance, record_results
-from eitbench.bench.tracks import Environment
 from eitbench.data.cache import CACHE_VARIABLE
 from eitbench.data.seeds import format_seed
 
 from short import FAST
-from tiny import FILTER, FIXED_LAG, RUN, git_says, sha, write_baseline
+from tiny import FILTER, RUN, git_says, sha, write_baseline
 
 ENV, COMMAND = "eitbench/Pipe2D-v0", "eitbench run --seeds train:1-2"
 
@@ -67,17 +65,6 @@ def test_round_trip(store):
         ("mine", "train:1"), ("mine", "train:2"), ("yours", "train:1")]
     assert result(2) in found
     np.testing.assert_array_equal(store.fields(result(2))["mean"], 2 * mean)
-
-
-def test_only_a_success_of_the_same_identity_is_held(store):
-    """Failed results, other code and other seeds do not count as done."""
-    store.put(result(), {})
-    store.put(failed(2), {})
-    assert store.has_result(ENV, "mine", 1, "abc")
-    assert not store.has_result(ENV, "mine", 1, "abd")
-    assert not store.has_result(ENV, "mine", 2, "abc")
-    assert not store.has_result(ENV, "mine", 3, "abc")
-    assert not store.has_result(ENV, "yours", 1, "abc")
 
 
 @pytest.mark.parametrize("number", [math.nan, math.inf, -math.inf])
@@ -153,16 +140,6 @@ def test_records_can_be_reproduced(played):
     assert not any("scores" in episode for episode in bad["episodes"])
 
 
-def test_each_episode_keeps_the_run_that_made_it(store):
-    """A record with episodes of several runs holds every run and the run of each episode."""
-    store.put(result(1), {})
-    store.put(result(2, run=RUN | {"command": "later"}), {})
-    store.put(result(3), {})
-    (record,) = store.write_records()
-    assert [run["command"] for run in record["runs"]] == [RUN["command"], "later"]
-    assert [episode["run"] for episode in record["episodes"]] == [0, 1, 0]
-
-
 def test_splits_are_not_mixed(store):
     """Development and training seeds are never in the record of another split; seeds are in numerical order."""
     for seed in (10, 9, 100):
@@ -235,14 +212,3 @@ def test_provenance_without_git(monkeypatch):
     monkeypatch.setenv("PATH", "")
     provenance.cache_clear()
     assert (provenance()["commit"], provenance()["dirty"]) == (None, None)
-
-
-def test_arguments_of_an_environment_make_other_records(store, tmp_path):
-    """Other keyword arguments of an id are another world: neither results nor records are overwritten."""
-    path = write_baseline(tmp_path)
-    wider = Environment(FILTER.id, json.dumps({"world": FAST | {"instrument": {"noise_relative": 0.02}}}))
-    run_jobs([Job(environment, path, 1) for environment in (FILTER, wider, FIXED_LAG)], store)
-    records = store.write_records()
-    noise = [record["environment"]["kwargs"]["world"].get("instrument", {}).get("noise_relative") for record in records]
-    assert sorted(noise, key=str) == [0.02, None, None]
-    assert len(list((store.folder / "records").iterdir())) == 3
