@@ -329,17 +329,15 @@ def _run_episode(episode: dict[str, Any], method: str) -> dict[str, Any]:
     with threadpool_limits(1):                                  # as for records
         played = runner.run_method(asked, load_method(method, asked.track), seed)
     numbers = compute_scores(asked.track, played.outcome)
-    return {key: episode[key] for key in ("environment", "kwargs", "seed")} | {
+    made = {key: episode[key] for key in ("environment", "kwargs", "seed")} | {
         "scores": {score: value for score, value in numbers.items()
-                   if value is not None and math.isfinite(value) and scores()[score].deterministic},
-        **_answer(played)}
-
-
-def _answer(played: runner.EpisodeRun) -> dict[str, Any]:
+                   if value is not None and math.isfinite(value) and scores()[score].deterministic}}
     if not played.fields:
-        return {"injections": [[int(step.argmax()), int(step.argmin())] if step.any() else []
-                               for step in played.currents]}
+        return made | {"injections": [
+            [int(step.argmax()), int(step.argmin())] if step.any() else []
+            for step in played.currents]}
     means = played.fields["mean"].astype(float)
     states = means[np.isfinite(means).all(axis=1)]
     nodes = np.linspace(0, means.shape[1] - 1, 7).astype(int)[1:-1]         # five inner ones
-    return {"mean": states[:, nodes].mean(axis=0).tolist(), "last": states[-1, nodes].tolist()}
+    return made | {"mean": states[:, nodes].mean(axis=0).tolist(),
+                   "last": states[-1, nodes].tolist()}

@@ -6,17 +6,15 @@ import io
 import math
 from collections.abc import Collection, Iterable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from eitbench._files import write_atomically
 from eitbench.bench.scores import Outcome
+from eitbench.envs.measured import MeasuredEnv
 from eitbench.measured.segmentation import ktc_score, segment
-
-if TYPE_CHECKING:
-    from eitbench.envs.measured import MeasuredEnv
-    from eitbench.worlds.task import Estimate
+from eitbench.worlds.task import Estimate
 
 N_PLOTTED_FRAMES = 60
 

@@ -9,6 +9,7 @@ import gymnasium as gym
 import numpy as np
 from tqdm import tqdm
 
+from eitbench import __version__
 from eitbench._extras import require_extra
 from eitbench.bench.methods import Method, load_method
 from eitbench.bench.runner import policy_generator
@@ -57,14 +58,17 @@ def export_minari(name: str, env: str, policy: str, seeds: str | Sequence[int], 
     presimulate(inner.world, numbers, n_jobs=n_jobs, backend=backend)
     episodes = [_run(made, method, seed, k) for k, seed in enumerate(
         tqdm(numbers, desc="running", unit="episode", disable=None))]
+    description = DESCRIPTION.format(
+        env=env, policy=method.name, title=method.title, version=__version__,
+        seeds=seed_ranges(map(format_seed, numbers)),
+        warning=WARNING if any(map(is_test, numbers)) else "").strip()
     returns = {row["group"]: float(row["mean"]) for row in published_returns(env)}
     # the id: the spec of an environment that was made has an episode limit, which would truncate
     create_dataset_from_buffers(name, episodes, env=env, eval_env=env, algorithm_name=method.name,
                                 author="The eitbench authors", requirements=["eitbench"],
                                 ref_min_score=returns.get("random"),
                                 ref_max_score=max(returns.values(), default=None),
-                                num_episodes_average_score=N_EPISODES,
-                                description=_description(env, method, numbers))
+                                num_episodes_average_score=N_EPISODES, description=description)
     return len(episodes)
 
 
@@ -97,10 +101,3 @@ def _run(env: gym.Env[Any, Any], policy: Method, seed: int, number: int) -> Epis
         steps.append((action, *rest))
     columns = map(np.array, zip(*steps, strict=True))  # in the buffer's order
     return EpisodeBuffer(number, seed, None, np.array(observations), *columns, infos={})
-
-
-def _description(env: str, policy: Method, seeds: Sequence[int]) -> str:
-    from eitbench import __version__
-    return DESCRIPTION.format(
-        env=env, policy=policy.name, title=policy.title, seeds=seed_ranges(map(format_seed, seeds)),
-        version=__version__, warning=WARNING if any(map(is_test, seeds)) else "").strip()

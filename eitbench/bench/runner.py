@@ -7,7 +7,7 @@ import json
 import time
 from collections.abc import Collection, Iterable, Iterator
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from threadpoolctl import threadpool_limits
@@ -24,6 +24,7 @@ from eitbench.data.episodes import cached_truth_model, simulate
 from eitbench.data.seeds import allow_test_seeds
 from eitbench.envs.estimation import EstimationEnv
 from eitbench.envs.injection import InjectionEnv
+from eitbench.envs.measured import MeasuredEnv
 from eitbench.estimation import best_homogeneous
 from eitbench.physics.cross_section import outlet_of
 from eitbench.physics.transport import ConvectionDiffusion
@@ -31,9 +32,6 @@ from eitbench.worlds.random_streams import episode_streams, generator_from_state
 from eitbench.worlds.registry import entry
 from eitbench.worlds.task import Estimate, Task
 from eitbench.worlds.world import World
-
-if TYPE_CHECKING:
-    from eitbench.envs.measured import MeasuredEnv
 
 Step = tuple[int, Estimate | None, dict[str, np.ndarray], float]
 """t of the estimate, the estimate, the last voltages and currents, and the computing time in s."""
@@ -296,10 +294,11 @@ def _iter_steps(env: EstimationEnv | MeasuredEnv, estimator: Method, seed: int,
     """Yield (t = i − lag, estimate, measurement i, computing time in s) at each step i."""
     with allow_test_seeds():
         observation, _ = env.reset(seed=seed)
-    if estimator.privileged and not isinstance(env, EstimationEnv):
-        raise ValueError(f"{estimator.name} needs the ground truth, which measurements do not have")
-    shown = (env.task, env.privileged_info()) \
-        if isinstance(env, EstimationEnv) and estimator.privileged else (env.task,)
+    shown: list[Any] = [env.task]
+    if estimator.privileged:
+        if not isinstance(env, EstimationEnv):
+            raise ValueError(f"{estimator.name} needs the ground truth, which measurements lack")
+        shown.append(env.privileged_info())
     begin = time.perf_counter()
     player = estimator.make(*shown)
     setup = time.perf_counter() - begin
@@ -320,17 +319,12 @@ def _iter_steps(env: EstimationEnv | MeasuredEnv, estimator: Method, seed: int,
             _check_estimate(estimate, env.task, np.isfinite(seen["voltages"]))
             if estimate.variance is not None and isinstance(env, EstimationEnv):
                 env.core.estimate_std = np.sqrt(estimate.variance)
-        observation, _, done, _, _ = env.step(
-            _action(env.task, silence if estimate is None else estimate))
+        answer = silence if estimate is None else estimate
+        action = answer.mean
+        if (flow := env.task.velocity) is not None:
+            action = np.append(action, flow.nominal if answer.velocity is None else answer.velocity)
+        observation, _, done, _, _ = env.step(action)
         yield t, estimate, seen, seconds
-
-
-def _action(task: Task, estimate: Estimate) -> np.ndarray:
-    """Return the environment's action; the flow is nominal if the estimate has none."""
-    if task.velocity is None:
-        return estimate.mean
-    flow = task.velocity.nominal if estimate.velocity is None else estimate.velocity
-    return np.concatenate([estimate.mean, flow])
 
 
 def _check_estimate(estimate: Any, task: Task, measured: np.ndarray) -> None:

@@ -23,16 +23,7 @@ from threadpoolctl import threadpool_limits
 
 from eitbench._files import PACKAGE, write_atomically
 from eitbench._sanitize import sanitize
-from eitbench.bench.records import (
-    COMMON_FIELDS,
-    SCHEMA,
-    check_record,
-    read_json,
-    read_records,
-    split_of,
-    with_content_hash,
-    write_record,
-)
+from eitbench.bench import records as stored
 from eitbench.bench.scores import SCORING
 from eitbench.data.cache import SIMULATION
 from eitbench.data.seeds import format_seed
@@ -97,8 +88,8 @@ class EpisodeStore:
         path = self._path(result["environment"]["name"], result["method"], result["seed"])
         path = path.with_suffix(".npz")
         try:
-            with np.load(path, allow_pickle=False) as stored:
-                fields = dict(stored)
+            with np.load(path, allow_pickle=False) as archive:
+                fields = dict(archive)
         except FileNotFoundError:
             raise
         # a damaged archive may raise zlib.error, NotImplementedError, RuntimeError, …
@@ -134,7 +125,7 @@ class EpisodeStore:
         written = []
         for record in self.records():
             try:
-                write_record(self.folder / "records", record)
+                stored.write_record(self.folder / "records", record)
             except ValueError as error:
                 warnings.warn(f"left out: {error}", stacklevel=2)
             else:
@@ -151,7 +142,7 @@ def _by_record(results: Iterable[dict[str, Any]],
     """Group results by environment, method and split, as in records."""
     groups: dict[tuple[str, str, str], list[dict[str, Any]]] = {}
     for result in results:
-        key = (result["environment"]["name"], result["method"], split_of(result["seed"]))
+        key = (result["environment"]["name"], result["method"], stored.split_of(result["seed"]))
         groups.setdefault(key, []).append(result)
     return groups
 
@@ -180,19 +171,19 @@ def _gathered(results: list[dict[str, Any]]) -> dict[str, Any]:
     for result in results:
         if result["run"] not in runs:
             runs.append(result["run"])
-    return with_content_hash({
-        "schema": SCHEMA, "official": False, "split": split_of(latest["seed"]),
-        **{key: latest[key] for key in COMMON_FIELDS},
+    return stored.with_content_hash({
+        "schema": stored.SCHEMA, "official": False, "split": stored.split_of(latest["seed"]),
+        **{key: latest[key] for key in stored.COMMON_FIELDS},
         "seeds": [result["seed"] for result in results], "runs": runs,
         "episodes": [{key: value for key, value in result.items()
-                      if key not in (*COMMON_FIELDS, "traceback")}
+                      if key not in (*stored.COMMON_FIELDS, "traceback")}
                      | {"run": runs.index(result["run"])} for result in results],
     })
 
 
 def record_results(record: dict[str, Any]) -> list[dict[str, Any]]:
     """Convert a record to episode results, as `EpisodeStore.results` yields them."""
-    shared = {key: record[key] for key in COMMON_FIELDS if key in record}
+    shared = {key: record[key] for key in stored.COMMON_FIELDS if key in record}
     runs = record.get("runs", [])
     return [episode | shared | ({"run": runs[episode["run"]]} if runs else {})
             for episode in record["episodes"]]
@@ -200,15 +191,15 @@ def record_results(record: dict[str, Any]) -> list[dict[str, Any]]:
 
 def folder_results(folder: Path) -> list[dict[str, Any]]:
     """Return the episode results of all records in a folder; errors as in `read_records`."""
-    return [result for record in read_records(folder) for result in record_results(record)]
+    return [result for record in stored.read_records(folder) for result in record_results(record)]
 
 
 def _read(path: Path) -> dict[str, Any]:
     """Read a result; ``ValueError`` if it is damaged or does not yield a valid record, with a
     message that does not name the file."""
-    result = read_json(path)
+    result = stored.read_json(path)
     try:
-        check_record(_gathered([result]))
+        stored.check_record(_gathered([result]))
     except (AttributeError, KeyError, TypeError) as error:
         raise ValueError(f"is not an episode result: {type(error).__name__}: {error}") from None
     return result  # type: ignore[no-any-return]

@@ -60,10 +60,9 @@ def verify(paths: Sequence[Path], folder: Path, *, file: str | None = None, isol
     Returns
     -------
     DataFrame
-        A row for each episode, or for a record that cannot be read or rerun: record, environment,
-        method, episode, isolation (of the rerun, or ``replay``), score (name of the score with the
-        largest relative difference), difference, recorded and rerun (ẽ_c), problem (a sentence if
-        they cannot be compared or other fields differ), note.
+        A row, with the columns of `EMPTY_ROW`, for each episode, or for a record that cannot be
+        read or rerun. ``score`` has the largest relative ``difference``; ``recorded`` and ``rerun``
+        are ẽ_c; ``problem`` is a sentence if they cannot be compared or other fields differ.
     """
     _check.integer("episodes", episodes, low=1)
     rows: list[dict[str, Any]] = []

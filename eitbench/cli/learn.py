@@ -37,20 +37,18 @@ def bank(
     with options.cli_errors():
         numbers = parse_seeds(seeds)
         world = entry(env).world
-    place = folder(world)
-    each = cached_episode_bytes(world)
-    try:
-        place.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise typer.BadParameter(f"episodes cannot be stored in {place}: {error}") from error
-    missing = len(missing_seeds(world, numbers))
-    options.echo(f"{len(numbers)} episodes, {len(numbers) * each / 1e6:.0f} MB in {place}; "
-                f"{missing} to simulate")
-    free = shutil.disk_usage(place).free
-    if missing * each > free:
-        raise typer.BadParameter(f"seeds need {missing * each / 1e9:.1f} GB more, and "
-                                 f"{free / 1e9:.1f} GB are free")
-    with options.cli_errors():
+        place, size = folder(world), cached_episode_bytes(world)
+        try:
+            place.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise ValueError(f"episodes cannot be stored in {place}: {error}") from error
+        missing = len(missing_seeds(world, numbers))
+        options.echo(f"{len(numbers)} episodes, {len(numbers) * size / 1e6:.0f} MB in {place}; "
+                     f"{missing} to simulate")
+        free = shutil.disk_usage(place).free
+        if missing * size > free:
+            raise ValueError(f"seeds need {missing * size / 1e9:.1f} GB more, and "
+                             f"{free / 1e9:.1f} GB are free")
         made = presimulate(world, numbers, n_jobs=jobs, backend=backend)
     options.echo(f"{made} simulated, {len(numbers) - made} were already stored")
 

@@ -27,7 +27,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from short import world
-from tiny import FILTER, FIXED_LAG, write_baseline
+from tiny import FILTER, FIXED_LAG, write_baseline, write_policy
 from tiny_worlds import TINY
 
 ROOT = Path(__file__).parents[2]
@@ -36,17 +36,6 @@ INJECTION = Environment(POLICY_ID, json.dumps(world(POLICY_ID) | {"estimator": "
 confined = pytest.mark.skipif(bool(bubblewrap_problem()), reason=bubblewrap_problem() or "bubblewrap works")
 KIND = "process" if bubblewrap_problem() else "bubblewrap"
 
-POLICY = '''"""Random: drawn uniformly."""
-
-
-class Policy:
-    def __init__(self, rules, random):
-        self.rules, self.random = rules, random
-
-    def act(self, observation):
-        {act}
-'''
-
 
 @pytest.fixture(autouse=True)
 def cache(run_cache, monkeypatch):
@@ -54,12 +43,6 @@ def cache(run_cache, monkeypatch):
     monkeypatch.setenv(CACHE_VARIABLE, run_cache)
     yield
     isolation.close()
-
-
-def write_policy(folder, act="return int(self.random.integers(self.rules.action_space.n))"):
-    path = folder / "drawn.py"
-    path.write_text(POLICY.format(act=act))
-    return str(path)
 
 
 def worker(path, kind="bubblewrap", **how):

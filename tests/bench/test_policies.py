@@ -27,6 +27,7 @@ from scipy.stats import t as student
 
 from injection_envs import BUDGET, CURRENTS, FAULTS, FLOW, INFLOW, NAME, TANK, filter_of, injected
 from short import merged, world
+from tiny import write_policy
 
 SHORT = world(NAME)
 KWARGS = {name: world(name) for name in (NAME, INFLOW, CURRENTS, FAULTS, FLOW, TANK)} | {
@@ -36,14 +37,6 @@ SEED = 5
 
 def environment(name: str) -> InjectionEnv:
     return runner.cached_environment(Environment(name, json.dumps(KWARGS[name] | {"estimator": "reduced"})))
-
-
-def write_policy(folder, body: str = "def act(self, observation): return 7", name: str = "mine") -> str:
-    """Return the path of a policy file whose class has this body."""
-    path = folder / f"{name}.py"
-    path.write_text('"""Mine: always the same."""\nclass Policy:\n'
-                    f"    def __init__(self, rules, random): pass\n    {body}\n")
-    return str(path)
 
 
 # -- belief -----------------------------------------------------------------------------------------------------------
@@ -182,7 +175,7 @@ def jobs_of(policies: list[str], seeds: str, **kwargs) -> list[Job]:
 def test_finished_and_failed_episodes_are_stored(tmp_path):
     """The record has the same format as for estimators; a failed episode has the reason, and no row."""
     store = EpisodeStore(tmp_path / "new")
-    bad = write_policy(tmp_path, "def act(self, observation): return 0.5", "bad")
+    bad = write_policy(tmp_path, "return 0.5", "bad")
     todo = jobs_of(["random_pair", "adjacent", bad], "dev:1,0", estimator="reduced")
     run_jobs(todo, store, command="eitbench run")
     rows = policy_rows(todo, store.results())
@@ -218,9 +211,10 @@ def test_errors_of_policies_are_ordered_and_pool_trainings():
 
 def test_unknown_names_are_reported(tmp_path):
     """Unknown policies, environments and estimators are reported, and a file without a policy."""
+    (tmp_path / "mine.py").write_text("class Policy: pass")
     (tmp_path / "greedy_a.zip").write_bytes(b"PK")
     for name, kwargs, policy, estimator, message in (
-            (NAME, SHORT, write_policy(tmp_path, "x = 1"), "full", r"mine\.py: Policy must have a method act\(observ"),
+            (NAME, SHORT, str(tmp_path / "mine.py"), "full", r"mine\.py: Policy must have a method act\(observ"),
             (NAME, SHORT, str(tmp_path / "greedy_a.zip"), "full", r"greedy_a\.zip has the name of a built-in method"),
             ("eitbench/Pipe2D-v0", {}, "adjacent", "full", "environment eitbench/Pipe2D-v0 is not of the track inj"),
             (NAME, SHORT, "adjacent", "none", "estimator must be one of full, reduced; got 'none'")):
