@@ -39,8 +39,6 @@ FIRST_STEPS = 24
 WORLD_EPISODES = {"train:0": FIRST_STEPS, "dev:0": None}
 """Seed -> number of simulated steps of a world's golden episode; None: the whole episode."""
 OBSERVATION_SEEDS = ("train:0", "dev:0", "dev:1")
-QUICK_SEEDS = ("train:0",)
-"""Seed of the only episode that a quick check computes: the shortened one."""
 SHORT_KWARGS = {"world": {"schedule": {"scored_steps": 4}}}
 """Arguments of a short episode of any environment."""
 RTOL_FLOAT64, RTOL_FLOAT32 = 1e-6, 1e-4
@@ -67,28 +65,10 @@ def golden_path(name: str) -> Path:
 def read_golden(name: str) -> dict[str, Any] | None:
     """Read a golden file; None if it is missing, ``ValueError`` if it is damaged."""
     path = golden_path(name)
-    return json.loads(path.read_text(encoding="utf-8")) if path.is_file() else None
-
-
-def check(name: str, *, is_quick: bool = False) -> list[str]:
-    """Compare a built-in id or method with its golden file: return one sentence for each number
-    that differs. Scores of a method that the file does not hold are ignored.
-
-    A quick check covers the first episode, which is shortened, and for a world also its model and
-    the first observations of that seed.
-    """
     try:
-        expected = read_golden(name)
+        return json.loads(path.read_text(encoding="utf-8")) if path.is_file() else None
     except ValueError as error:                                 # invalid JSON or UTF-8
-        return [f"the golden file of {name} is damaged: {error}"]
-    if expected is None:
-        return [f"{name} has no golden file: {golden_path(name)} is missing"]
-    if is_quick and name in tracks.builtin_ids():
-        expected |= {part: {seed: expected[part][seed] for seed in QUICK_SEEDS}
-                     for part in ("episodes", "observations")}
-    elif is_quick:
-        expected["episodes"] = expected["episodes"][:1]
-    return _differences(name, _computed(name, expected, is_quick), expected)
+        raise ValueError(f"golden file {path} is damaged: {error}") from None
 
 
 def update(names: list[str], *, new_version: bool = False) -> Iterator[tuple[str, str, list[str]]]:
@@ -104,8 +84,8 @@ def update(names: list[str], *, new_version: bool = False) -> Iterator[tuple[str
         _check.choice("each of names", name, known)
     for name in names or known:
         expected = read_golden(name)
-        computed = _computed(name, expected)
-        moved = _differences(name, computed, expected) if expected else []
+        computed = compute(name, expected)
+        moved = compare(name, computed, expected) if expected else []
         status = "moved" if moved else "same" if expected else "new"
         is_method = "method" in computed
         if expected and not moved and is_method:
@@ -124,17 +104,18 @@ def update(names: list[str], *, new_version: bool = False) -> Iterator[tuple[str
         yield name, status, moved
 
 
-def _computed(name: str, expected: dict[str, Any] | None, is_quick: bool = False) -> dict[str, Any]:
+def compute(name: str, expected: dict[str, Any] | None) -> dict[str, Any]:
     """Compute the content of a golden file, for a method with the episodes of the ``expected``."""
     if name in tracks.builtin_ids():
-        return round_numbers(world_golden(name, is_quick=is_quick))
+        return world_golden(name, tuple(WORLD_EPISODES), OBSERVATION_SEEDS)
     method = golden_methods()[name]
     golden = expected or _new_golden(name, method)
     return golden | {"episodes": [_run_episode(episode, method) for episode in golden["episodes"]]}
 
 
-def _differences(name: str, computed: dict[str, Any], expected: dict[str, Any]) -> list[str]:
-    """Return one sentence for each number of two contents of a golden file that differs."""
+def compare(name: str, computed: dict[str, Any], expected: dict[str, Any]) -> list[str]:
+    """Return one sentence for each number of two contents of a golden file that differs, without
+    scores of a method that the ``expected`` lacks."""
     if "method" not in expected:
         return [f"{name}: {sentence}" for sentence in differences(computed, expected)]
     found = []
@@ -178,12 +159,10 @@ def _is_numeric(value: Any) -> bool:
 # -- worlds ----------------------------------------------------------------------------------------
 
 
-def world_golden(id: str, *, is_quick: bool = False) -> dict[str, Any]:
-    """Compute the golden numbers of a registered id: of its world, and its first observations."""
-    episodes = QUICK_SEEDS if is_quick else tuple(WORLD_EPISODES)
-    seeds = QUICK_SEEDS if is_quick else OBSERVATION_SEEDS
-    return {"id": id, **world_numbers(entry(id).world, episodes),
-            "observations": {seed: first_observations(id, seed) for seed in seeds}}
+def world_golden(id: str, episodes: tuple[str, ...], seeds: tuple[str, ...]) -> dict[str, Any]:
+    """Compute golden numbers of an id: of its world, and first observations with these seeds."""
+    return round_numbers({"id": id, **world_numbers(entry(id).world, episodes), "observations": {
+        seed: first_observations(id, seed) for seed in seeds}})
 
 
 @lru_cache(maxsize=2)
