@@ -97,12 +97,8 @@ def baseline_folder() -> Path:
     return bundled_path("baselines")
 
 
-def builtin_methods(track: str) -> list[str]:
-    """Return the names of the built-in methods of a track, without agents."""
-    return list(_builtin_paths(track))
-
-
-def _builtin_paths(track: str) -> dict[str, Path]:
+def builtin_methods(track: str) -> dict[str, Path]:
+    """Map names to files of the built-in methods of a track, without agents."""
     folder = baseline_folder() / METHOD_KINDS[track].folder
     return {path.stem: path for path in sorted(folder.glob("*.py"))}
 
@@ -122,7 +118,7 @@ def builtin_agents(id: str) -> list[str]:
 def builtin_files(id: str) -> dict[str, Path]:
     """Map the names of results to the files of all built-in methods and of the agents of an
     environment; checkpoints of agents may be missing."""
-    return (_builtin_paths("estimation") | _builtin_paths("injection")
+    return (builtin_methods("estimation") | builtin_methods("injection")
             | {f"{path.parents[1].name}_{path.parent.name}": path for path in _agents(id)})
 
 
@@ -274,7 +270,7 @@ def find_method(name: str, track: str) -> Path:
     """Return the file of a method by its name, if it is built in or installed, or by its path.
     ``ValueError`` if the file is missing, or has the name of another method."""
     form = METHOD_KINDS[track]
-    own = _builtin_paths(track)
+    own = builtin_methods(track)
     if is_path(name):
         path = resolve_input(Path(name))
     else:

@@ -54,18 +54,6 @@ def failed(seed):
 # -- episodes ---------------------------------------------------------------------------------------------------------
 
 
-def test_round_trip(store):
-    """Results and estimates are read as they were stored, for every estimator and seed."""
-    mean = np.random.default_rng(1).normal(size=(5, 7)).astype(np.float32)
-    for baseline, seed in (("mine", 1), ("mine", 2), ("yours", 1)):
-        store.put(result(seed, baseline), {"mean": seed * mean})
-    found = list(store.results())
-    assert sorted((r["method"], r["seed"]) for r in found) == [
-        ("mine", "train:1"), ("mine", "train:2"), ("yours", "train:1")]
-    assert result(2) in found
-    np.testing.assert_array_equal(store.fields(result(2))["mean"], 2 * mean)
-
-
 @pytest.mark.parametrize("number", [math.nan, math.inf, -math.inf])
 def test_numbers_that_json_lacks_are_rejected(number, store):
     """NaN and Infinity are rejected before any file is replaced."""
