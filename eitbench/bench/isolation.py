@@ -186,14 +186,13 @@ def encode_message(content: Mapping[str, Any]) -> bytes:
     return struct.pack("<QQ", len(head), len(body)) + head + body
 
 
-def decode_message(read: Callable[[int], bytes], max_array_bytes: int = MAX_ARRAY_BYTES,
-                   ) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+def decode_message(read: Callable[[int], bytes]) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     """Decode the values and the arrays of the next message; ``read(n)`` returns exactly n bytes.
     ``ValueError`` if the message is too long or malformed."""
     head_bytes, body_bytes = struct.unpack("<QQ", read(16))
-    if head_bytes > MAX_HEADER_BYTES or body_bytes > max_array_bytes:
+    if head_bytes > MAX_HEADER_BYTES or body_bytes > MAX_ARRAY_BYTES:
         raise ValueError(f"a message must have at most {MAX_HEADER_BYTES} bytes of JSON and "
-                         f"{max_array_bytes} of arrays, got {head_bytes} and {body_bytes}")
+                         f"{MAX_ARRAY_BYTES} of arrays, got {head_bytes} and {body_bytes}")
     head, body = read(head_bytes), read(body_bytes)
     arrays = {}
     position = 0
@@ -202,7 +201,7 @@ def decode_message(read: Callable[[int], bytes], max_array_bytes: int = MAX_ARRA
         _check.depth("values", values)
         json.dumps(values, ensure_ascii=False).encode()  # a lone surrogate cannot be stored
         for name, dtype, shape in layout:
-            sizes = [_check.integer("axis", size, low=0, high=max_array_bytes) for size in shape]
+            sizes = [_check.integer("axis", size, low=0, high=MAX_ARRAY_BYTES) for size in shape]
             array = np.frombuffer(body + b"\0" * 8, _numeric(dtype), math.prod(sizes), position)
             arrays[str(name)] = array.reshape(sizes).copy()
             position += array.nbytes
@@ -290,10 +289,10 @@ def _load(track: str, id: str, kwargs: str, method: str, isolation: str, path: P
 class Worker:
     """A process that runs one estimator or policy in one environment, episode after episode.
 
-    ``method`` is the name of a built-in method, or the path of a file. The content of the file is
-    read once and sent to the process, which makes a separate environment. Calls raise `WorkerError`
-    if the method fails, and ``ValueError`` if a process under bubblewrap could read the cache
-    folder.
+    ``method`` is the name of a built-in method, or the path of a file, which is read once and
+    copied to the folder of the process; the process makes a separate environment. Calls raise
+    `WorkerError` if the method fails, and ``ValueError`` if a process under bubblewrap could read
+    the cache folder.
     """
 
     reply_timeout = 600.0
@@ -302,7 +301,7 @@ class Worker:
     def __init__(self, track: str, id: str, kwargs: dict[str, Any], method: str,
                  isolation: str = "bubblewrap", *, limits: Limits | None = None) -> None:
         self.sha256 = ""
-        """hash of the files that are sent; empty for a built-in method"""
+        """hash of the method's files; empty for a built-in method"""
         self.about: dict[str, Any] = {}
         """Unchecked attributes that the method's class reports."""
         self.suits: Callable[[Any], bool] = lambda _: bool(self.about.get("suits"))
@@ -311,24 +310,41 @@ class Worker:
         self._is_confined = isolation == "bubblewrap"
         self._deadline = math.inf
         self._process: Any = None
-        self._request = {"track": track, "id": id, "kwargs": kwargs, **self._files(id, method)}
+        self._files: dict[str, bytes] = {}
+        if is_path(method) and is_builtin(method):
+            method = str(Path(method).resolve())
+        elif is_path(method):
+            self._files = methods.method_files(Path(method))
+            self.sha256 = method_sha256(self._files)
+            method = Path(method).name
+        # registered at run time, which another process does not know
+        by_hand = [each for each in runtime_entries() if each.id == id]
+        self._meshes = [Path(file) for each in by_hand
+                        for file in getattr(each.world.vessel, "files", ())]
+        entry = b"".join(map(cloudpickle.dumps, by_hand))
+        self._request = {"track": track, "id": id, "kwargs": kwargs, "method": method,
+                         "entry": np.frombuffer(entry, np.uint8)}
 
     def start(self) -> None:
         """Unless it runs, start the process, in place of the process of the current worker."""
         if self.is_alive:
             return
         close()
+        self._folder = tempfile.TemporaryDirectory(prefix="eitbench-", ignore_cleanup_errors=True)
+        self._home = Path("/tmp" if self._is_confined else self._folder.name)
+        place = Path(self._folder.name, "method")
+        place.mkdir()
+        for name, content in self._files.items():
+            (place / name).write_bytes(content)
         command = [sys.executable, "-P", "-c", f"from {__name__} import main; main()",
                    json.dumps(self._limits)]
         if self._is_confined:
             check_out_of_reach(cache_folder(), "the cache folder")
             models = cache_folder() / model_key("", None, 0).folder         # holds no episode
-            files = {"/tmp/cache/models": str(models.absolute())}
+            files = {"/tmp/method": str(place), "/tmp/cache/models": str(models.absolute())}
             # a relative path is relative to the worker's folder /tmp
             files |= {str("/tmp" / path): str(path.absolute()) for path in self._meshes}
             command = [*bubblewrap(self._limits, files), *command]
-        self._folder = tempfile.TemporaryDirectory(prefix="eitbench-", ignore_cleanup_errors=True)
-        self._home = Path("/tmp" if self._is_confined else self._folder.name)
         self._process = subprocess.Popen(
             command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL,
             start_new_session=True, env=self._environment())
@@ -382,23 +398,6 @@ class Worker:
             "PATH": os.environ.get("PATH", ""), "PYTHONPATH": str(PACKAGE.parent),
             "HOME": str(self._home), "TMPDIR": str(self._home), "PYTHONDONTWRITEBYTECODE": "1",
             CACHE_VARIABLE: str(cache_folder())} | (inside if self._is_confined else {})
-
-    def _files(self, id: str, method: str) -> dict[str, Any]:
-        """Return the name of the method, the contents of its files, and the registry entry of an
-        environment that was registered at run time."""
-        by_hand = [each for each in runtime_entries() if each.id == id]
-        self._meshes = [Path(file) for each in by_hand
-                        for file in getattr(each.world.vessel, "files", ())]
-        contents = {"entry": b"".join(map(cloudpickle.dumps, by_hand))}
-        if is_path(method) and is_builtin(method):
-            method = str(Path(method).resolve())
-        elif is_path(method):
-            files = methods.method_files(Path(method))
-            contents |= {f"file:{name}": content for name, content in files.items()}
-            method = Path(method).name
-            self.sha256 = method_sha256(files)
-        return {"method": method} | {name: np.frombuffer(content, np.uint8)
-                                     for name, content in contents.items()}
 
     def _ask(self, do: str, **content: Any) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
         """Send a request with the arguments of a method of `_MethodServer`, print the output of the
@@ -501,7 +500,7 @@ def main() -> None:
     while True:
         sys.stdout = sys.stderr = printed = io.StringIO()
         try:
-            values, arrays = decode_message(partial(_read_exactly, incoming), 2 * MAX_ARRAY_BYTES)
+            values, arrays = decode_message(partial(_read_exactly, incoming))
         except EOFError:
             return
         try:
@@ -555,19 +554,15 @@ class _MethodServer:
     _known: Any
     _instance: Any
 
-    def load(self, track: str, id: str, kwargs: dict[str, Any], method: str, entry: np.ndarray,
-             **files: np.ndarray) -> dict[str, Any]:
+    def load(self, track: str, id: str, kwargs: dict[str, Any], method: str,
+             entry: np.ndarray) -> dict[str, Any]:
         """Load the method and return the attributes of its class."""
         import gymnasium as gym
         if entry.size:  # unpickling is safe: the parent process sent it
             import_entries([cloudpickle.loads(entry.tobytes())])
-        if files:
-            self._file = Path.home() / "method" / method
-            self._file.parent.mkdir()
-        for name, content in files.items():
-            self._file.with_name(name.removeprefix("file:")).write_bytes(content.tobytes())
         env: Any = gym.make(id, disable_env_checker=True, **kwargs).unwrapped
-        self._method = load_method(str(self._file) if files else method, track)
+        self._file = Path.home() / "method" / method
+        self._method = load_method(str(self._file) if self._file.is_file() else method, track)
         self._known = env.task if track == "estimation" else env.rules
         attributes = ("name", "title", "subtracks", "parameters", "role", "privileged")
         about = {name: getattr(self._method, name) for name in attributes}
