@@ -105,17 +105,14 @@ def train(
 ) -> None:
     """Train an agent to choose injections.
 
-    The same command resumes from the last checkpoint. The folder receives model.zip, config.json,
-    evaluations.npz (scores on dev episodes), K.monitor.csv (training episodes of the K-th start,
-    with rewards times reward_scale) and logs for TensorBoard.
+    The same command resumes from the last checkpoint. Episodes that `eitbench bank` has not stored
+    are simulated when they begin. The folder receives model.zip, config.json, evaluations.npz
+    (scores on dev episodes), K.monitor.csv (training episodes of the K-th start, with rewards times
+    reward_scale) and logs for TensorBoard.
     """
     from dataclasses import replace
 
     import numpy as np
-
-    from eitbench.data.presimulation import missing_seeds
-    from eitbench.data.seeds import SPLITS
-    from eitbench.worlds.registry import entry
     with options.cli_errors():
         from eitbench.rl import training
         asked = training.read_config(config)
@@ -124,13 +121,6 @@ def train(
         folder = out or Path("results/training") / env.replace("/", "-") / algo / f"seed{seed}"
         options.echo(f"{asked.total_steps} steps of {algo.value}, configured by {config}, with "
                      f"evaluations every {asked.interval} steps, in {folder}")
-        splits = {"dev": asked.evaluation_episodes, "train": asked.episodes}
-        missing = {f"{split}:0-{n - 1}": len(missing_seeds(entry(env).world, SPLITS[split][:n]))
-                   for split, n in splits.items()}
-        if any(missing.values()):
-            options.echo("episodes are simulated when they begin; not stored are "
-                         f"{' and '.join(f'{n} of {seeds}' for seeds, n in missing.items())}; "
-                         "`eitbench bank` simulates them in advance on all cores")
         model = training.train(env, algo.value, asked, seed, folder)
     last = {name: values[-1] for name, values in np.load(folder / "evaluations.npz").items()}
     options.echo(f"wrote {model}: ẽ_c {last['errors'].mean():.3g}, return "
