@@ -14,7 +14,6 @@ import math
 import re
 import warnings
 from collections.abc import Iterable, Iterator
-from contextlib import suppress
 from functools import lru_cache
 from itertools import filterfalse, islice
 from pathlib import Path
@@ -47,16 +46,14 @@ _BUILTIN_VERSION = re.compile(r"v([1-9][0-9]*)")
 
 def write_record(folder: Path, record: dict[str, Any]) -> Path:
     """Write a record into ``folder`` atomically and return its path; a file of the same name is
-    replaced. ``ValueError``, naming file and fields, if it breaks the schema."""
+    replaced. ``ValueError``, naming method and fields, if it breaks the schema."""
     record = with_content_hash(record)
-    name = "(nameless)"
-    with suppress(KeyError, TypeError):               # the check names the missing field
-        name = record_file_name(record)
-    path = Path(folder) / name
     try:
         check_record(record)
     except ValueError as error:
-        raise ValueError(f"record {sanitize(str(path))} {sanitize(str(error))}") from None
+        name = sanitize(str(record.get("method")))
+        raise ValueError(f"record of {name} {sanitize(str(error))}") from None
+    path = Path(folder) / record_file_name(record)
     write_atomically(path, _text(record).encode())
     return path
 

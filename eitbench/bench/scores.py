@@ -124,6 +124,17 @@ class Score:
         return value if isinstance(value, int) else float(value)
 
 
+_initialise = Score.__init__
+
+
+def _accept_old_keywords(score: Score, *args: Any, **fields: Any) -> None:
+    """Initialise a score, also with the former names of its fields, as third-party packages do."""
+    names = {"of": "compute", "better": "direction", "needs": "requires",
+             "repeats": "deterministic"}
+    _initialise(score, *args, **{names.get(name, name): value for name, value in fields.items()})
+
+
+Score.__init__ = _accept_old_keywords  # type: ignore[assignment]
 _scores: dict[str, Score] = {}
 
 

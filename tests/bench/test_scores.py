@@ -112,7 +112,7 @@ def test_only_scores_with_a_direction_are_compared(name, records):
     ({"name": "My score"}, "name must be of lower-case"),
     ({"name": "error"}, "has the name or heading of another, error"),
     ({"heading": "CRPS"}, "has the name or heading of another, crps"),
-    ({"direction": "more"}, "direction must be one of lower, higher"),
+    ({"better": "more"}, "direction must be one of lower, higher"),
     ({"requires": ("luck",)}, "each of requires must be one of .*got 'luck'"),
     ({"tracks": ("sprint",)}, "each of tracks must be one of estimation, injection, measured; got 'sprint'"),
     ({"factor": 0.0}, "factor must be")])
