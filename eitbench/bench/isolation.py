@@ -123,8 +123,6 @@ _notify_once = cache(notify)
 @cache
 def bubblewrap_problem() -> str:
     """Return the reason why bubblewrap cannot confine a process here; empty if it can."""
-    if not shutil.which("bwrap"):
-        return "bubblewrap is not installed"
     command = [*bubblewrap(Limits()), sys.executable, "-S", "-c", ""]
     try:
         done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
@@ -592,11 +590,10 @@ class _MethodServer:
     def describe(self, error: BaseException) -> dict[str, str]:
         """Return an error as the header of a reply."""
         message = f"{type(error).__name__}: {error}".replace(f"{self._file.parent}/", "")
-        found = {"error": message, "where": error_location(error, self._file),
-                 "traceback": user_traceback(error, self._file)}
-        return {key: _sendable(value, MAX_TEXT_CHARS) for key, value in found.items()}
+        return {"error": _sendable(message), "where": error_location(error, self._file),
+                "traceback": _sendable(user_traceback(error, self._file))}
 
 
-def _sendable(text: str, length: int = MAX_OUTPUT_CHARS) -> str:
+def _sendable(text: str) -> str:
     """Truncate a text, and replace lone surrogates, which UTF-8 cannot encode."""
-    return text[:length].encode(errors="replace").decode()
+    return text[:MAX_OUTPUT_CHARS].encode(errors="replace").decode()
