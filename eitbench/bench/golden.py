@@ -282,7 +282,9 @@ def _fixed_action(env: gym.Env, k: int) -> Any:
 
 def _new_golden(name: str, method: str) -> dict[str, Any]:
     """Return a method's golden file without numbers: episodes of its first environment."""
-    id = next(id for id in tracks.builtin_ids() if _is_compatible(method, id))
+    id = next((id for id in tracks.builtin_ids() if _is_compatible(method, id)), None)
+    if id is None:
+        raise ValueError(f"method {name} must be compatible with a built-in environment")
     return {"method": name, "version": 1, "tolerance": RTOL_FLOAT64, "episodes": [
         {"environment": id, "kwargs": kwargs, "seed": seed} for kwargs, seed in (
             (SHORT_KWARGS, "dev:0"), (SHORT_KWARGS, "dev:1"), ({}, "dev:0"))]}

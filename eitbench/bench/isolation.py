@@ -590,8 +590,9 @@ class _MethodServer:
     def describe(self, error: BaseException) -> dict[str, str]:
         """Return an error as the header of a reply."""
         message = f"{type(error).__name__}: {error}".replace(f"{self._file.parent}/", "")
-        return {"error": _sendable(message), "where": error_location(error, self._file),
-                "traceback": _sendable(user_traceback(error, self._file))}
+        found = {"error": message, "where": error_location(error, self._file),
+                 "traceback": user_traceback(error, self._file)}
+        return {key: _sendable(value) for key, value in found.items()}
 
 
 def _sendable(text: str) -> str:
