@@ -329,37 +329,34 @@ def _iter_steps(env: EstimationEnv | MeasuredEnv, estimator: Method, seed: int,
 
 def _check_estimate(estimate: Any, task: Task, measured: np.ndarray) -> None:
     """Check an estimate; the innovation may be NaN where ``measured`` (m,) is false."""
-    n = task.mesh.n_nodes
     if not isinstance(estimate, Estimate):
         raise ValueError("Estimator.update must return an Estimate or None, got "
                          f"{type(estimate).__name__}")
-    _check.array("Estimate.mean", estimate.mean, (n,), units="mol/m³")
-    variance, innovation, covariance, velocity, velocity_variance = estimate[1:]
-    for name, value in (("velocity", velocity), ("velocity_variance", velocity_variance)):
-        if value is not None:
-            if task.velocity is None:
-                raise ValueError(f"Estimate.{name} must be None where the flow is not estimated, "
-                                 f"got {value!r}")
-            _check.array(f"Estimate.{name}", value, (task.velocity.n_parameters,))
-    if innovation is not None:
-        innovation = _check.array("Estimate.innovation", innovation, measured.shape, units="V",
-                                  allow_nan=not measured.all())
-        if np.isnan(innovation[measured]).any():
-            raise ValueError("Estimate.innovation must be finite where a voltage was measured, got "
-                             "NaN")
-    if covariance is not None:
-        _check_covariance(covariance, len(measured))
-    if variance is not None and not (np.shape(variance) == (n,) and np.isfinite(variance).all()
-                                     and (np.asarray(variance) >= 0).all()):
-        raise ValueError(f"Estimate.variance must be finite, ≥ 0 and of shape ({n},), got shape "
-                         f"{np.shape(variance)}")
-
-
-def _check_covariance(covariance: Any, size: int) -> None:
-    _check.array("Estimate.innovation_covariance", covariance, (size, size), units="V²")
-    given = np.asarray(covariance, float)
-    spectrum = np.linalg.eigvalsh(0.5 * given + 0.5 * given.T)
-    # else νᵀS⁻¹ν could be negative
-    if spectrum[0] <= size * np.finfo(float).eps * spectrum[-1]:
-        raise ValueError("Estimate.innovation_covariance must be positive definite, got "
-                         f"eigenvalues from {spectrum[0]:g} to {spectrum[-1]:g} V²")
+    n, m = task.mesh.n_nodes, len(measured)
+    k = 0 if task.velocity is None else task.velocity.n_parameters
+    given: dict[str, np.ndarray] = {}
+    for name, shape, units in (
+            ("mean", (n,), "mol/m³"), ("variance", (n,), "(mol/m³)²"), ("innovation", (m,), "V"),
+            ("innovation_covariance", (m, m), "V²"), ("velocity", (k,), "m/s"),
+            ("velocity_variance", (k,), "(m/s)²")):
+        value = getattr(estimate, name)
+        if value is not None and shape == (0,):
+            raise ValueError(f"Estimate.{name} must be None where the flow is not estimated, got "
+                             f"{value!r}")
+        if value is not None or name == "mean":
+            given[name] = _check.array(
+                f"Estimate.{name}", value, shape, units=units,
+                allow_nan=name == "innovation" and not measured.all())
+    if "variance" in given and (given["variance"] < 0).any():
+        raise ValueError("Estimate.variance must be at least 0 (mol/m³)², got "
+                         f"{given['variance'].min():g}")
+    if "innovation" in given and np.isnan(given["innovation"][measured]).any():
+        raise ValueError("Estimate.innovation must be finite where a voltage was measured, got "
+                         "NaN")
+    if "innovation_covariance" in given:
+        covariance = given["innovation_covariance"]
+        spectrum = np.linalg.eigvalsh(0.5 * covariance + 0.5 * covariance.T)
+        # else νᵀS⁻¹ν could be negative
+        if spectrum[0] <= m * np.finfo(float).eps * spectrum[-1]:
+            raise ValueError("Estimate.innovation_covariance must be positive definite, got "
+                             f"eigenvalues from {spectrum[0]:g} to {spectrum[-1]:g} V²")
