@@ -13,3 +13,7 @@ def main() -> None:
     except ModuleNotFoundError as error:
         sys.exit(str(error))
     app()
+
+
+if __name__ == "__main__":
+    main()
