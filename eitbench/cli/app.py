@@ -152,9 +152,8 @@ for _command in (learn.bank, learn.train, learn.export, estimate, fetch):
 def leaderboard(
     out: options.Out = Path("results"),
     records: Annotated[Path | None, typer.Option(
-        help="Folder of the leaderboards' records, such as leaderboards/results: render "
-             "leaderboard.csv, leaderboard.md, episodes.csv.xz and the pages site/ next to it "
-             "instead.")] = None,
+        help="Folder of the leaderboards' records: render leaderboard.csv, leaderboard.md, "
+             "episodes.csv.xz and the pages site/ next to it instead.")] = None,
     env: options.Environments = None,
 ) -> None:
     """Print the table and rewrite the HTML report from the results stored in a folder.

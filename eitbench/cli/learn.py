@@ -174,8 +174,8 @@ def fit_model(
     modes: Annotated[int, typer.Option(
         min=1, help="Number of concentration modes; more make filters slower.")] = 64,
     correct: Annotated[bool, typer.Option(
-        "--correct", help="Keep the task's flow model and fit only its residual; needs fewer "
-                          "episodes.")] = False,
+        "--correct", help="Fit only the residual of the task's flow model; needs fewer episodes.",
+    )] = False,
     linearised: Annotated[bool, typer.Option(
         "--linearised", help="Linearise voltages once, about the homogeneous estimate, and fit the "
                              "covariance of the residuals.")] = False,
