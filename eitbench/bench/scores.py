@@ -172,11 +172,6 @@ def compute_scores(track: str, outcome: Outcome) -> dict[str, float | None]:
     return {name: each(outcome) for name, each in scores(kind).items()}
 
 
-def _contrast_error(outcome: Any) -> float:
-    return scoring.relative_error(outcome.mean, outcome.truth, outcome.mass,
-                                  reference=outcome.homogeneous)
-
-
 def _velocity_error(outcome: Any) -> float:
     estimated, true, weights = outcome.velocity
     return scoring.relative_error(estimated, true, np.diag(weights))
@@ -223,7 +218,9 @@ for _score in (
     Score("contrast_error", "contrast",
           "error relative to the deviation of the truth from the homogeneous estimate of the whole "
           "episode, which has 1",
-          _contrast_error, requires=("mean", "truth")),
+          lambda outcome: scoring.relative_error(outcome.mean, outcome.truth, outcome.mass,
+                                                 reference=outcome.homogeneous),
+          requires=("mean", "truth")),
     Score("nis", "NIS/m",
           "normalised innovation squared of all scored measurements; 1 if the filter's uncertainty "
           "is calibrated",
