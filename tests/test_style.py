@@ -10,7 +10,7 @@ import pytest
 ROOT = Path(__file__).parent.parent
 PACKAGE = ROOT / "eitbench"
 BUDGETS = {"numerics": 1658, "scoring": 121, "physics": 1639, "worlds": 2820, "data": 1520, "estimation": 6378,
-           "measured": 1972, "envs": 1664, "bench": 4608, "report": 2939, "rl": 848, "cli": 979}
+           "measured": 1972, "envs": 1664, "bench": 4609, "report": 2939, "rl": 848, "cli": 979}
 """Package (or module) -> lines of Python allowed, blank lines and docstrings included. Each imports only from those
 before it."""
 TOP = 433

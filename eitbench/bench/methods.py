@@ -89,7 +89,8 @@ class Method(NamedTuple):
     def suits(self, world: Any) -> bool:
         """Return whether it is compatible with a `Task` of its subtracks, or with `Rules`, as its
         optional function ``suits`` determines."""
-        return bool(getattr(self.make, "suits", lambda _: True)(world))
+        suits = getattr(self.make, "suits", None)
+        return suits is None or bool(suits(world))
 
 
 def baseline_folder() -> Path:
