@@ -88,8 +88,7 @@ def array(name: str, value: object, shape: Iterable[int | None], *, units: str =
 
 
 def choice(name: str, value: object, known: Iterable[str]) -> None:
-    """Raise ``ValueError``, which lists ``known`` or the most similar of many, unless ``value`` is
-    among them."""
+    """Raise ``ValueError``, which lists similar names, unless ``value`` is among ``known``."""
     names = list(known)
     if value in names:
         return
@@ -101,8 +100,7 @@ def choice(name: str, value: object, known: Iterable[str]) -> None:
 
 
 def did_you_mean(given: object, known: Iterable[str]) -> str:
-    """Return ``. Did you mean …?`` to append to a message that lists ``known``; empty if no name
-    is similar."""
+    """Return ``. Did you mean …?`` with the most similar name, if any, to append to a message."""
     names = {name.casefold(): name for name in known}
     found = difflib.get_close_matches(str(given).casefold(), names, n=1)
     return f". Did you mean {names[found[0]]}?" if found else ""

@@ -23,16 +23,8 @@ def notify(text: str) -> None:
 
 
 class SlowTaskNotice:
-    """Report once that a task of ``total`` steps will take longer than `NOTIFY_AFTER_S`.
-
-    Parameters
-    ----------
-    what : str
-        Description of the task.
-    total : int
-    beforehand : str
-        Hint how to do the task in advance.
-    """
+    """Report once that a task of ``total`` steps, described by ``what``, will take longer than
+    `NOTIFY_AFTER_S`, with a hint how to do it ``beforehand``."""
 
     def __init__(self, what: str, total: int, beforehand: str) -> None:
         self._what = what

@@ -56,6 +56,25 @@ def write_baseline(folder: Path, name: str = "mine", *, doc: str = "Mine: the sa
     return str(path)
 
 
+POLICY = '''"""Mine: drawn at random."""
+
+
+class Policy:
+    def __init__(self, rules, random):
+        self.rules, self.random, self.space = rules, random, rules.action_space
+
+    def act(self, observation):
+        {act}
+'''
+
+
+def write_policy(folder: Path, act: str = "return int(self.random.integers(self.space.n))", name: str = "mine") -> str:
+    """Write a policy file with these statements in ``act`` and return its path."""
+    path = Path(folder) / f"{name}.py"
+    path.write_text(POLICY.format(act=act))
+    return str(path)
+
+
 def git_says(monkeypatch, commit: str | None = None, status: str | None = "") -> None:
     """Set the commit in records; None: outside a checkout."""
     def said(*words: str) -> str | None:

@@ -19,13 +19,8 @@ _COLUMNS = ("environment", "board", "method", "version", "title", "role", "privi
 def load(folder: Path | str | None = None, *, measured: bool = False) -> pd.DataFrame:
     """Load all records of a folder as a tidy table: one row for each score of each episode.
 
-    Parameters
-    ----------
-    folder : path
-        Default: the published records, ``leaderboards/results``, or the table of their episodes
-        where only that is installed.
-    measured : bool
-        Include records of measured cases, which are in a checkout only.
+    The default folder is ``leaderboards/results``, the published records, or the table of their
+    episodes where only that is installed. Records of ``measured`` cases are in a checkout only.
 
     Returns
     -------
@@ -35,10 +30,7 @@ def load(folder: Path | str | None = None, *, measured: bool = False) -> pd.Data
         ``leaderboards/schema.json`` (s, V², bytes). A failed episode has one row, with the metric
         error and no value. ``outdated`` marks records of a superseded version of a built-in method.
 
-    Raises
-    ------
-    ValueError
-        Naming the folder if it is missing, or a file that is not a valid record.
+    ``ValueError``, naming the folder if it is missing, or a file that is not a valid record.
     """
     with require_extra("eitbench.leaderboard.load"):
         import pandas as pd

@@ -77,9 +77,8 @@ def _record(row: dict[str, str]) -> dict[str, Any]:
 
 
 def _episode(row: dict[str, str]) -> dict[str, Any]:
-    peak = row["peak_memory"]
     episode: dict[str, Any] = {name: row[name] for name in ("seed", "status", "finished")}
-    episode["peak_memory"] = int(peak) if peak else None
+    episode["peak_memory"] = int(row["peak_memory"]) if row["peak_memory"] else None
     if row["status"] == "ok":
         names = list(row)[len(_COLUMNS):]
         episode["scores"] = {name: float(row[name]) for name in names if row[name]}

@@ -26,15 +26,13 @@ def evaluate(method: Any, env: str | gym.Env, seeds: str | Iterable[int], *,
              n_jobs: int = 1, isolate: str | None = None) -> pd.DataFrame:
     """Run a method on episodes and compute the same scores as the commands.
 
-    By default the method's code runs in this process, with all its rights: it can access the ground
-    truth, files and the network. Use ``isolate`` for a third-party file.
-
     ``method`` is a class ``Estimator`` or ``Policy`` as in a method's file, the name of a built-in
     method, or the path of a file; ``env`` a registered id, or an environment made by
     `gymnasium.make`, whose arguments are used; ``seeds`` such as ``"dev:0-9"``, or numbers;
     ``world`` and ``estimator`` are arguments of `gymnasium.make`: changes of the world, and the
     filter inside an injection environment (default: "full"). ``isolate`` is the option of
-    ``eitbench run``, for a method given by name or path.
+    ``eitbench run``, for a third-party file: by default the method's code runs in this process and
+    can access the ground truth, files and the network.
 
     Returns
     -------
@@ -52,7 +50,6 @@ def evaluate(method: Any, env: str | gym.Env, seeds: str | Iterable[int], *,
                          f"estimator, got {estimator!r}")
     if isinstance(method, str | Path):         # a worker loads it: its module cannot be pickled
         runner: Method | Job = isolated_job(asked, str(method), isolate or "none")
-        _method(runner)                        # an invalid file is reported before a worker starts
     elif isolate is None:
         runner = resolve_method(method, asked.track)
     else:
@@ -62,10 +59,11 @@ def evaluate(method: Any, env: str | gym.Env, seeds: str | Iterable[int], *,
         _check.integer("seeds", seed, low=0) for seed in seeds]
     if not numbers:
         raise ValueError("seeds must name at least one episode, got none")
+    name = _method(runner).name                # an invalid file is reported before a run starts
     work = [(asked, runner, seed) for seed in numbers]
     played = run_parallel(_row, work, _check.integer("n_jobs", n_jobs, low=1))
-    bar = tqdm(played, total=len(work), desc=_method(runner).name, unit="episode", disable=None)
-    rows = {row["seed"]: row for row in bar}
+    rows = {row["seed"]: row for row in tqdm(played, total=len(work), desc=name, unit="episode",
+                                             disable=None)}
     return pd.DataFrame([rows[format_seed(seed)] for seed in dict.fromkeys(numbers)])
 
 
@@ -89,13 +87,11 @@ def _row(asked: Environment, runner: Method | Job, seed: int) -> dict[str, Any]:
 
 
 def resolve_environment(given: str | gym.Env, **kwargs: Any) -> Environment:
-    """Return the environment of an id, or made by `gymnasium.make`, with the ``kwargs`` that are
-    not None."""
+    """Return the environment of an id, or made by `gymnasium.make`, with ``kwargs`` unless None."""
     changes = {name: value for name, value in kwargs.items() if value is not None}
     if isinstance(given, str):
         return Environment(given, json.dumps(changes))
-    spec = getattr(given, "spec", None)
-    if spec is None:
+    if (spec := getattr(given, "spec", None)) is None:
         raise ValueError("env must be an id, or made by gymnasium.make, got "
                          f"{type(given).__name__}")
     arguments = {key: value for key, value in spec.kwargs.items() if key != "name"}
@@ -103,6 +99,7 @@ def resolve_environment(given: str | gym.Env, **kwargs: Any) -> Environment:
 
 
 def resolve_method(given: Any, track: str) -> Method:
+    """Load a method of a track, given as in `evaluate`."""
     if isinstance(given, str | Path):
         return load_method(str(given), track)
     if not isinstance(given, type):

@@ -1,9 +1,9 @@
 """Golden files: expected values of a few episodes of each world and of each built-in method.
 
-A version of a world or method changes with these values, not with the code. Each world's file holds
-values of its model, of two simulated episodes (one of full length), and the first observations of
-its environment; each method's file holds scores and estimates in two short episodes and in one of
-full length. Tolerances allow for differences between processors and BLAS kernels.
+A version of a world or method changes with these values, not with the code. A world's file holds
+values of its model, of two simulated episodes, and its environment's first observations; a method's
+file holds scores and estimates in two short episodes and in one of full length. Tolerances allow
+for differences between processors and BLAS kernels.
 """
 
 from __future__ import annotations
@@ -39,16 +39,9 @@ FIRST_STEPS = 24
 WORLD_EPISODES = {"train:0": FIRST_STEPS, "dev:0": None}
 """Seed -> number of simulated steps of a world's golden episode; None: the whole episode."""
 OBSERVATION_SEEDS = ("train:0", "dev:0", "dev:1")
-FAST_EPISODES = ("train:0",)
-"""Seed of the only episode that a quick check computes: the shortened one."""
 SHORT_KWARGS = {"world": {"schedule": {"scored_steps": 4}}}
 """Arguments of a short episode of any environment."""
-N_OBSERVATIONS = 3
-"""Number of observations for each of these seeds: one from `reset` and two from `step`."""
-N_ENTRIES = 5
-"""Number of an estimate's nodes that a golden file holds."""
-RTOL_FLOAT64 = 1e-6
-RTOL_FLOAT32 = 1e-4
+RTOL_FLOAT64, RTOL_FLOAT32 = 1e-6, 1e-4
 """Relative tolerances. The reduced filter and stored load vectors are in single precision."""
 
 
@@ -72,51 +65,27 @@ def golden_path(name: str) -> Path:
 def read_golden(name: str) -> dict[str, Any] | None:
     """Read a golden file; None if it is missing, ``ValueError`` if it is damaged."""
     path = golden_path(name)
-    return json.loads(path.read_text(encoding="utf-8")) if path.is_file() else None
-
-
-def check(name: str, *, is_quick: bool = False) -> list[str]:
-    """Compare a built-in id or method with its golden file: return one sentence for each number
-    that differs. Scores of a method that the file does not hold are ignored.
-
-    A quick check covers the first episode, which is shortened, and for a world also its model and
-    the first observations of that seed.
-    """
     try:
-        expected = read_golden(name)
+        return json.loads(path.read_text(encoding="utf-8")) if path.is_file() else None
     except ValueError as error:                                 # invalid JSON or UTF-8
-        return [f"the golden file of {name} is damaged: {error}"]
-    if expected is None:
-        return [f"{name} has no golden file: {golden_path(name)} is missing"]
-    if is_quick and name in tracks.builtin_ids():
-        expected |= {part: {seed: expected[part][seed] for seed in FAST_EPISODES}
-                     for part in ("episodes", "observations")}
-    elif is_quick:
-        expected["episodes"] = expected["episodes"][:1]
-    return _differences(name, _computed(name, expected, is_quick), expected)
+        raise ValueError(f"golden file {path} is damaged: {error}") from None
 
 
 def update(names: list[str], *, new_version: bool = False) -> Iterator[tuple[str, str, list[str]]]:
     """Compare built-in ids and methods (default: all) with their golden files, and write missing
-    files.
+    files. Yield name, status (``new``, ``same``, ``moved``, or the new version) and differences.
 
     With ``new_version``, a method's file whose numbers differ is rewritten with the next version
-    number; otherwise it is not changed. A world's file is never changed.
-
-    Yields
-    ------
-    name, status, differences
-        ``status`` is ``new``, ``same``, ``moved``, or the new version.
-
-    ``ValueError`` if a name is neither a built-in id nor a built-in method.
+    number. A world's file is never changed. ``ValueError`` if a name is neither a built-in id nor a
+    built-in method.
     """
     known = [*tracks.builtin_ids(), *golden_methods()]
     for name in names:
         _check.choice("each of names", name, known)
     for name in names or known:
         expected = read_golden(name)
-        computed = _computed(name, expected)
-        moved = _differences(name, computed, expected) if expected else []
+        computed = compute(name, expected)
+        moved = compare(name, computed, expected) if expected else []
         status = "moved" if moved else "same" if expected else "new"
         is_method = "method" in computed
         if expected and not moved and is_method:
@@ -130,22 +99,23 @@ def update(names: list[str], *, new_version: bool = False) -> Iterator[tuple[str
             computed["version"] += 1
             status = f"v{computed['version']}"
         if status != "moved" and computed != expected:
-            write_atomically(golden_path(name), to_json(computed).encode())
+            write_atomically(golden_path(name), f"{json.dumps(computed, indent=1)}\n".encode())
             methods.golden_version.cache_clear()
         yield name, status, moved
 
 
-def _computed(name: str, expected: dict[str, Any] | None, is_quick: bool = False) -> dict[str, Any]:
+def compute(name: str, expected: dict[str, Any] | None) -> dict[str, Any]:
     """Compute the content of a golden file, for a method with the episodes of the ``expected``."""
     if name in tracks.builtin_ids():
-        return round_numbers(world_golden(name, is_quick=is_quick))
+        return world_golden(name, tuple(WORLD_EPISODES), OBSERVATION_SEEDS)
     method = golden_methods()[name]
     golden = expected or _new_golden(name, method)
     return golden | {"episodes": [_run_episode(episode, method) for episode in golden["episodes"]]}
 
 
-def _differences(name: str, computed: dict[str, Any], expected: dict[str, Any]) -> list[str]:
-    """Return one sentence for each number of two contents of a golden file that differs."""
+def compare(name: str, computed: dict[str, Any], expected: dict[str, Any]) -> list[str]:
+    """Return one sentence for each number of two contents of a golden file that differs, without
+    scores of a method that the ``expected`` lacks."""
     if "method" not in expected:
         return [f"{name}: {sentence}" for sentence in differences(computed, expected)]
     found = []
@@ -156,18 +126,10 @@ def _differences(name: str, computed: dict[str, Any], expected: dict[str, Any]) 
     return found
 
 
-def to_json(numbers: dict[str, Any]) -> str:
-    """Format a golden file: one line for each number."""
-    return json.dumps(numbers, indent=1) + "\n"
-
-
 def differences(computed: Any, expected: Any, tolerance: float = RTOL_FLOAT64,
                 place: str = "") -> list[str]:
-    """Describe each number of two golden files that differs by more than the tolerance.
-
-    Both arguments are decoded JSON. A difference is relative to the largest number of its list;
-    observations of a world have the tolerance `RTOL_FLOAT32`.
-    """
+    """Describe each number of two golden files, decoded JSON, that differs by more than the
+    tolerance relative to the largest number of its list; for observations it is `RTOL_FLOAT32`."""
     if isinstance(computed, dict) and isinstance(expected, dict):
         if computed.keys() != expected.keys():
             others = ", ".join(sorted(computed.keys() ^ expected.keys()))
@@ -197,26 +159,18 @@ def _is_numeric(value: Any) -> bool:
 # -- worlds ----------------------------------------------------------------------------------------
 
 
-def world_golden(id: str, *, is_quick: bool = False) -> dict[str, Any]:
-    """Compute the golden numbers of a registered id: of its world, and its first observations."""
-    episodes, seeds = (FAST_EPISODES, FAST_EPISODES) if is_quick else ((*WORLD_EPISODES,),
-                                                                   OBSERVATION_SEEDS)
-    return {"id": id, **world_numbers(entry(id).world, episodes),
-            "observations": {seed: first_observations(id, seed) for seed in seeds}}
+def world_golden(id: str, episodes: tuple[str, ...], seeds: tuple[str, ...]) -> dict[str, Any]:
+    """Compute golden numbers of an id: of its world, and first observations with these seeds."""
+    return round_numbers({"id": id, **world_numbers(entry(id).world, episodes), "observations": {
+        seed: first_observations(id, seed) for seed in seeds}})
 
 
 @lru_cache(maxsize=2)
 def world_numbers(world: World, episodes: tuple[str, ...]) -> dict[str, Any]:
-    """Compute numbers of a world's model and of its golden episodes.
-
-    Returns
-    -------
-    dict
-        JSON-ready: ``model`` (computed voltages in V, a transport step in mol/m³), and for each of
-        ``episodes`` some entries of 𝓡 in Ω, noise draws, voltages in V, load vectors b_t,
-        ∫(c − background)², ∫c², load vectors of the velocity, faults, ĉ_bh in mol/m³, and the mean
-        relative error of that estimate.
-    """
+    """Compute numbers of a world: ``model`` (computed voltages in V, a transport step in mol/m³),
+    and for each of ``episodes`` some entries of 𝓡 in Ω, noise draws, voltages in V, load vectors
+    b_t, ∫(c − background)², ∫c², load vectors of the velocity, faults, ĉ_bh in mol/m³, and the mean
+    relative error of that estimate."""
     return {"model": _model_numbers(world.truth_config),
             "episodes": {name: _episode_numbers(world, name) for name in episodes}}
 
@@ -293,12 +247,13 @@ def _episode_numbers(world: World, name: str) -> dict[str, Any]:
 
 
 def first_observations(id: str, name: str) -> dict[str, Any]:
-    """Return some entries of the first observations of an environment, and the rewards."""
+    """Return some entries of the first observations of an environment, one from `reset` and two
+    from `step`, and the rewards."""
     env = gym.make(id)
     observation, _ = env.reset(seed=parse_seeds(name)[0])
     numbers: dict[str, Any] = {"0": _observation_sample(observation)}
     rewards = []
-    for k in range(1, N_OBSERVATIONS):
+    for k in (1, 2):
         observation, reward, _, _, _ = env.step(_fixed_action(env, k))
         numbers[str(k)] = _observation_sample(observation)
         rewards.append(float(reward))
@@ -326,17 +281,16 @@ def _fixed_action(env: gym.Env, k: int) -> Any:
 
 
 def _new_golden(name: str, method: str) -> dict[str, Any]:
-    """Return a method's golden file without numbers: episodes of the first environment with which
-    it is compatible; ``ValueError`` without one."""
-    for id in tracks.builtin_ids():
-        if _can_play(method, id):
-            return {"method": name, "version": 1, "tolerance": RTOL_FLOAT64, "episodes": [
-                {"environment": id, "kwargs": kwargs, "seed": seed} for kwargs, seed in (
-                    (SHORT_KWARGS, "dev:0"), (SHORT_KWARGS, "dev:1"), ({}, "dev:0"))]}
-    raise ValueError(f"method {name} must be compatible with a built-in environment")
+    """Return a method's golden file without numbers: episodes of its first environment."""
+    id = next((id for id in tracks.builtin_ids() if _is_compatible(method, id)), None)
+    if id is None:
+        raise ValueError(f"method {name} must be compatible with a built-in environment")
+    return {"method": name, "version": 1, "tolerance": RTOL_FLOAT64, "episodes": [
+        {"environment": id, "kwargs": kwargs, "seed": seed} for kwargs, seed in (
+            (SHORT_KWARGS, "dev:0"), (SHORT_KWARGS, "dev:1"), ({}, "dev:0"))]}
 
 
-def _can_play(method: str, id: str) -> bool:
+def _is_compatible(method: str, id: str) -> bool:
     asked = tracks.Environment(id, json.dumps(SHORT_KWARGS))
     if is_path(method):
         return Path(method).parents[2].name == id.replace("/", "-")
@@ -356,17 +310,15 @@ def _run_episode(episode: dict[str, Any], method: str) -> dict[str, Any]:
     with threadpool_limits(1):                                  # as for records
         played = runner.run_method(asked, load_method(method, asked.track), seed)
     numbers = compute_scores(asked.track, played.outcome)
-    return {key: episode[key] for key in ("environment", "kwargs", "seed")} | {
+    made = {key: episode[key] for key in ("environment", "kwargs", "seed")} | {
         "scores": {score: value for score, value in numbers.items()
-                   if value is not None and math.isfinite(value) and scores()[score].deterministic},
-        **_answer(played)}
-
-
-def _answer(played: runner.EpisodeRun) -> dict[str, Any]:
+                   if value is not None and math.isfinite(value) and scores()[score].deterministic}}
     if not played.fields:
-        return {"injections": [[int(step.argmax()), int(step.argmin())] if step.any() else []
-                               for step in played.currents]}
+        return made | {"injections": [
+            [int(step.argmax()), int(step.argmin())] if step.any() else []
+            for step in played.currents]}
     means = played.fields["mean"].astype(float)
     states = means[np.isfinite(means).all(axis=1)]
-    nodes = np.linspace(0, means.shape[1] - 1, N_ENTRIES + 2).astype(int)[1:-1]
-    return {"mean": states[:, nodes].mean(axis=0).tolist(), "last": states[-1, nodes].tolist()}
+    nodes = np.linspace(0, means.shape[1] - 1, 7).astype(int)[1:-1]         # five inner ones
+    return made | {"mean": states[:, nodes].mean(axis=0).tolist(),
+                   "last": states[-1, nodes].tolist()}

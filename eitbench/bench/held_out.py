@@ -50,10 +50,11 @@ def read_secret(path: Path) -> bytes:
         raise ValueError(f"secret {path} must be readable by its owner only; use `chmod 600`")
     if len(secret) != SECRET_BYTES:
         raise ValueError(f"secret {path} must have {SECRET_BYTES} bytes, got {len(secret)}")
+    digest = hashlib.sha256(secret).hexdigest()
     committed = json.loads(COMMITMENT.read_text())["salt_sha256"] if COMMITMENT.exists() else None
-    if committed != hashlib.sha256(secret).hexdigest():
-        raise ValueError(f"secret {path} has the sha256 {hashlib.sha256(secret).hexdigest()}, but "
-                         f"{COMMITMENT} commits to {committed}")
+    if committed != digest:
+        raise ValueError(f"secret {path} has the sha256 {digest}, but {COMMITMENT} commits to "
+                         f"{committed}")
     return secret
 
 
@@ -86,15 +87,13 @@ def verify_all_held_out(paths: Sequence[Path], folder: Path, file: str | None, i
 
 def verify_held_out(record: dict[str, Any], job: Job, secret: bytes,
                     episodes: int) -> tuple[dict[str, str], list[str]]:
-    """Run a record's method on held-out episodes, and test whether the recorded errors are smaller.
+    """Run a record's method, by the ``job`` of `verify.job_for_record`, on held-out episodes, and
+    test whether the recorded errors are smaller. Errors are relative to the naive baseline's, which
+    is run here too, on the same episodes.
 
-    Both errors are relative to the error of the naive baseline on the same episodes, which is run
-    here too.
-
-    ``job`` is the result of `verify.job_for_record`. Returns a row with the geometric means of the
-    relative errors, recorded and held-out, and p; and a sentence for each problem. ``ValueError``
-    if the episodes are too few for the test, or a third-party method is not confined by bubblewrap
-    and could read the seeds.
+    Returns a row with the geometric means of the relative errors, recorded and held-out, and p; and
+    a sentence for each problem. ``ValueError`` if the episodes are too few for the test, or a
+    third-party method is not confined by bubblewrap and could read the seeds.
     """
     if not is_builtin(job.method) and job.isolation != "bubblewrap":
         raise ValueError(f"{job.method} must run under bubblewrap on held-out episodes, got "
@@ -126,11 +125,10 @@ def verify_held_out(record: dict[str, Any], job: Job, secret: bytes,
 def p_value(recorded: np.ndarray, held_out: np.ndarray, n_resamples: int = 9999) -> float:
     """Return the p-value of a one-sided permutation test: the fraction of random divisions in which
     mean(recorded) − mean(held-out) is at most the actual difference."""
-    result = permutation_test(
+    return float(permutation_test(
         (recorded, held_out), lambda a, b, axis: a.mean(axis=axis) - b.mean(axis=axis),
         vectorized=True, alternative="less", n_resamples=n_resamples,
-        random_state=np.random.default_rng(0))
-    return float(result.pvalue)
+        random_state=np.random.default_rng(0)).pvalue)
 
 
 def _errors(job: Job, seeds: list[int]) -> list[Any]:

@@ -18,7 +18,6 @@ import os
 import re
 import shutil
 import signal
-import socket
 import struct
 import subprocess
 import sys
@@ -50,7 +49,6 @@ from eitbench.worlds.task import Estimate
 
 ISOLATE = ("auto", "none", "process", "bubblewrap")
 """Values of the option ``isolate``."""
-REPLY_TIMEOUT_S = 600.0
 CHECK_INTERVAL_S = 0.2
 """time between two checks of a worker's memory and number of threads"""
 MAX_HEADER_BYTES = 1 << 20
@@ -58,8 +56,6 @@ MAX_ARRAY_BYTES = 1 << 28
 MAX_OUTPUT_CHARS = 10_000
 """limit of the printed text that is shown for one reply"""
 MAX_TEXT_CHARS = 2000
-METHOD_NAME = re.compile(r"[^./\\][^/\\]{0,99}")
-TITLE = re.compile(f".{{1,{methods.MAX_TITLE_CHARS}}}")
 NUMERIC_ENV = ("OPENBLAS_", "MKL_", "OMP_", "NPY_", "NUMBA_CPU")
 """Prefixes of environment variables that change the last bits of results."""
 ETC = ("alternatives", "group", "ld.so.cache", "localtime", "nsswitch.conf", "passwd")
@@ -127,8 +123,6 @@ _notify_once = cache(notify)
 @cache
 def bubblewrap_problem() -> str:
     """Return the reason why bubblewrap cannot confine a process here; empty if it can."""
-    if not shutil.which("bwrap"):
-        return "bubblewrap is not installed"
     command = [*bubblewrap(Limits()), sys.executable, "-S", "-c", ""]
     try:
         done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
@@ -190,14 +184,13 @@ def encode_message(content: Mapping[str, Any]) -> bytes:
     return struct.pack("<QQ", len(head), len(body)) + head + body
 
 
-def decode_message(read: Callable[[int], bytes], max_array_bytes: int = MAX_ARRAY_BYTES,
-                   ) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+def decode_message(read: Callable[[int], bytes]) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     """Decode the values and the arrays of the next message; ``read(n)`` returns exactly n bytes.
     ``ValueError`` if the message is too long or malformed."""
     head_bytes, body_bytes = struct.unpack("<QQ", read(16))
-    if head_bytes > MAX_HEADER_BYTES or body_bytes > max_array_bytes:
+    if head_bytes > MAX_HEADER_BYTES or body_bytes > MAX_ARRAY_BYTES:
         raise ValueError(f"a message must have at most {MAX_HEADER_BYTES} bytes of JSON and "
-                         f"{max_array_bytes} of arrays, got {head_bytes} and {body_bytes}")
+                         f"{MAX_ARRAY_BYTES} of arrays, got {head_bytes} and {body_bytes}")
     head, body = read(head_bytes), read(body_bytes)
     arrays = {}
     position = 0
@@ -206,7 +199,7 @@ def decode_message(read: Callable[[int], bytes], max_array_bytes: int = MAX_ARRA
         _check.depth("values", values)
         json.dumps(values, ensure_ascii=False).encode()  # a lone surrogate cannot be stored
         for name, dtype, shape in layout:
-            sizes = [_check.integer("axis", size, low=0, high=max_array_bytes) for size in shape]
+            sizes = [_check.integer("axis", size, low=0, high=MAX_ARRAY_BYTES) for size in shape]
             array = np.frombuffer(body + b"\0" * 8, _numeric(dtype), math.prod(sizes), position)
             arrays[str(name)] = array.reshape(sizes).copy()
             position += array.nbytes
@@ -240,15 +233,13 @@ def load_isolated(track: str, id: str, kwargs: str, method: str, isolation: str)
     """
     path = methods.find_method(method, track)
     sha256 = method_sha256(methods.method_files(path))
-    loaded = _load(track, id, kwargs, method, isolation, path, sha256)
-    if loaded.privileged:
-        raise ValueError(f"{path} is privileged: it needs the ground truth")
-    return loaded
+    return _load(track, id, kwargs, method, isolation, path, sha256)
 
 
 def peak_memory() -> int | None:
     """Return the peak memory in bytes of a process of the current worker; None if unknown."""
-    return next((worker.peak_memory for worker in _started), None)
+    family = [pid for worker in _started for pid in worker._family()]
+    return max((_status(pid, "VmHWM") for pid in family), default=0) or None
 
 
 def close() -> None:
@@ -277,32 +268,38 @@ def _load(track: str, id: str, kwargs: str, method: str, isolation: str, path: P
     about = worker.about
     # a worker may report any name
     name: Any = path.stem if path.suffix == ".py" else about.get("name")
-    for key, value, limit in (("name", name, METHOD_NAME), ("title", about.get("title"), TITLE)):
-        if not isinstance(value, str) or not limit.fullmatch(value) or sanitize(value) != value:
+    title = f".{{1,{methods.MAX_TITLE_CHARS}}}"
+    for key, value, pattern in (("name", name, r"[^./\\][^/\\]{0,99}"),
+                                ("title", about.get("title"), title)):
+        if (not isinstance(value, str) or not re.fullmatch(pattern, value)
+                or sanitize(value) != value):
             raise ValueError(f"{path} reports an invalid {key}")
     built_in = methods.builtin_files(id).get(name)
     if built_in is not None and methods.builtin_sha256(built_in) != worker.sha256:
         raise ValueError(f"{path} has the name of a built-in method, {name}, under which "
                          "results are stored; rename it")
-    return methods.method_from_attributes(track, name, str(path), worker, about)._replace(
-        title=about["title"], path=path, sha256=worker.sha256)
+    loaded = methods.method_from_attributes(track, name, str(path), worker, about)
+    if loaded.privileged:
+        raise ValueError(f"{path} is privileged: it needs the ground truth")
+    return loaded._replace(title=about["title"], path=path, sha256=worker.sha256)
 
 
 class Worker:
     """A process that runs one estimator or policy in one environment, episode after episode.
 
-    ``method`` is the name of a built-in method, or the path of a file. The content of the file is
-    read once and sent to the process, which makes a separate environment. A reply may take
-    ``reply_timeout`` seconds. Calls raise `WorkerError` if the method fails, and ``ValueError`` if
-    a process under bubblewrap could read the cache folder.
+    ``method`` is the name of a built-in method, or the path of a file, which is read once and
+    copied to the folder of the process; the process makes a separate environment. Calls raise
+    `WorkerError` if the method fails, and ``ValueError`` if a process under bubblewrap could read
+    the cache folder.
     """
 
+    reply_timeout = 600.0
+    """s, longest time of a reply"""
+
     def __init__(self, track: str, id: str, kwargs: dict[str, Any], method: str,
-                 isolation: str = "bubblewrap", *, limits: Limits | None = None,
-                 reply_timeout: float = REPLY_TIMEOUT_S) -> None:
-        self.reply_timeout = reply_timeout
+                 isolation: str = "bubblewrap", *, limits: Limits | None = None) -> None:
         self.sha256 = ""
-        """hash of the method's file; empty for a built-in method"""
+        """hash of the method's files; empty for a built-in method"""
         self.about: dict[str, Any] = {}
         """Unchecked attributes that the method's class reports."""
         self.suits: Callable[[Any], bool] = lambda _: bool(self.about.get("suits"))
@@ -311,31 +308,44 @@ class Worker:
         self._is_confined = isolation == "bubblewrap"
         self._deadline = math.inf
         self._process: Any = None
-        self._request = {"track": track, "id": id, "kwargs": kwargs, **self._files(id, method)}
+        self._files: dict[str, bytes] = {}
+        if is_path(method) and is_builtin(method):
+            method = str(Path(method).resolve())
+        elif is_path(method):
+            self._files = methods.method_files(Path(method))
+            self.sha256 = method_sha256(self._files)
+            method = Path(method).name
+        # registered at run time, which another process does not know
+        by_hand = [each for each in runtime_entries() if each.id == id]
+        self._meshes = [Path(file) for each in by_hand
+                        for file in getattr(each.world.vessel, "files", ())]
+        entry = b"".join(map(cloudpickle.dumps, by_hand))
+        self._request = {"track": track, "id": id, "kwargs": kwargs, "method": method,
+                         "entry": np.frombuffer(entry, np.uint8)}
 
     def start(self) -> None:
-        """Unless the process runs, start one that loads the method, in place of the process of the
-        current worker."""
+        """Unless it runs, start the process, in place of the process of the current worker."""
         if self.is_alive:
             return
         close()
+        self._folder = tempfile.TemporaryDirectory(prefix="eitbench-", ignore_cleanup_errors=True)
+        self._home = Path("/tmp" if self._is_confined else self._folder.name)
+        place = Path(self._folder.name, "method")
+        place.mkdir()
+        for name, content in self._files.items():
+            (place / name).write_bytes(content)
         command = [sys.executable, "-P", "-c", f"from {__name__} import main; main()",
                    json.dumps(self._limits)]
         if self._is_confined:
             check_out_of_reach(cache_folder(), "the cache folder")
             models = cache_folder() / model_key("", None, 0).folder         # holds no episode
-            files = {"/tmp/cache/models": str(models.absolute())}
+            files = {"/tmp/method": str(place), "/tmp/cache/models": str(models.absolute())}
             # a relative path is relative to the worker's folder /tmp
             files |= {str("/tmp" / path): str(path.absolute()) for path in self._meshes}
             command = [*bubblewrap(self._limits, files), *command]
-        self._folder = tempfile.TemporaryDirectory(prefix="eitbench-", ignore_cleanup_errors=True)
-        self._home = Path("/tmp" if self._is_confined else self._folder.name)
-        ours, theirs = socket.socketpair()
-        with ours, theirs:
-            self._stream = ours.makefile("rwb")
-            self._process = subprocess.Popen(
-                command, stdin=theirs.fileno(), stdout=theirs.fileno(), stderr=subprocess.DEVNULL,
-                start_new_session=True, env=self._environment(), cwd=Path.cwd())
+        self._process = subprocess.Popen(
+            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL,
+            start_new_session=True, env=self._environment())
         _started.append(self)
         self._exceeded = ""
         threading.Thread(target=self._watch, args=(self._process,), daemon=True).start()
@@ -367,17 +377,13 @@ class Worker:
         """True if the process runs; it ends after a crash, a limit or a malformed message."""
         return self._process is not None and self._process.poll() is None
 
-    @property
-    def peak_memory(self) -> int | None:
-        """Peak memory in bytes of one of its processes; None where /proc does not report it."""
-        return max((_status(pid, "VmHWM") for pid in self._family()), default=0) or None
-
     def close(self) -> None:
         """End the process and its children, and remove its folder."""
         if self._process is not None:
             _kill(self._process)
             with suppress(OSError):  # data that it has not read
-                self._stream.close()
+                self._process.stdin.close()
+            self._process.stdout.close()
             self._folder.cleanup()
 
     def _environment(self) -> dict[str, str]:
@@ -391,31 +397,14 @@ class Worker:
             "HOME": str(self._home), "TMPDIR": str(self._home), "PYTHONDONTWRITEBYTECODE": "1",
             CACHE_VARIABLE: str(cache_folder())} | (inside if self._is_confined else {})
 
-    def _files(self, id: str, method: str) -> dict[str, Any]:
-        """Return the name of the method, the contents of its files, and the registry entry of an
-        environment that was registered at run time."""
-        by_hand = [each for each in runtime_entries() if each.id == id]
-        self._meshes = [Path(file) for each in by_hand
-                        for file in getattr(each.world.vessel, "files", ())]
-        contents = {"entry": b"".join(map(cloudpickle.dumps, by_hand))}
-        if is_path(method) and is_builtin(method):
-            method = str(Path(method).resolve())
-        elif is_path(method):
-            files = methods.method_files(Path(method))
-            contents |= {f"file:{name}": content for name, content in files.items()}
-            method = Path(method).name
-            self.sha256 = method_sha256(files)
-        return {"method": method} | {name: np.frombuffer(content, np.uint8)
-                                     for name, content in contents.items()}
-
     def _ask(self, do: str, **content: Any) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-        """Send a request with the arguments of one of the methods of `_MethodServer`, and return
-        the values and arrays of the reply."""
+        """Send a request with the arguments of a method of `_MethodServer`, print the output of the
+        worker's method, and return the values and arrays of the reply."""
         self._deadline = time.monotonic() + self.reply_timeout
         try:
-            self._stream.write(encode_message({"do": do, **content}))
-            self._stream.flush()
-            reply, arrays = decode_message(partial(_read_exactly, self._stream))
+            self._process.stdin.write(encode_message({"do": do, **content}))
+            self._process.stdin.flush()
+            reply, arrays = decode_message(partial(_read_exactly, self._process.stdout))
         except (EOFError, ConnectionError):
             with suppress(subprocess.TimeoutExpired):
                 self._process.wait(1.0)
@@ -431,7 +420,9 @@ class Worker:
             raise
         finally:
             self._deadline = math.inf
-        self._show(str(reply.pop("printed", ""))[:MAX_OUTPUT_CHARS].rstrip("\n"))
+        if printed := str(reply.pop("printed", ""))[:MAX_OUTPUT_CHARS].rstrip("\n"):
+            lines = sanitize(printed, lines=True).replace("\n", f"\n[{self._name}] ")
+            sys.stderr.write(f"[{self._name}] {lines}\n")
         if "error" in reply:
             message, where, traceback = (str(reply.get(name))[:MAX_TEXT_CHARS]
                                          for name in ("error", "where", "traceback"))
@@ -439,12 +430,6 @@ class Worker:
             failed.where, failed.traceback = where, traceback
             raise failed
         return reply, arrays
-
-    def _show(self, printed: str) -> None:
-        """Print the method's output, each line prefixed with its name."""
-        if printed:
-            lines = sanitize(printed, lines=True).replace("\n", f"\n[{self._name}] ")
-            sys.stderr.write(f"[{self._name}] {lines}\n")
 
     def _watch(self, process: subprocess.Popen[bytes]) -> None:
         """Kill the process after the deadline of a reply, or when it and its children have too much
@@ -468,8 +453,7 @@ class Worker:
             _kill(process)
 
     def _family(self) -> list[int]:
-        """Return the ids of the process and its descendants; stop soon after the limit is
-        exceeded."""
+        """Return the ids of the process and its descendants, not many more than the limit."""
         found: list[int] = []
         left = [self._process.pid]
         while left and len(found) <= self._limits.threads:
@@ -514,7 +498,7 @@ def main() -> None:
     while True:
         sys.stdout = sys.stderr = printed = io.StringIO()
         try:
-            values, arrays = decode_message(partial(_read_exactly, incoming), 2 * MAX_ARRAY_BYTES)
+            values, arrays = decode_message(partial(_read_exactly, incoming))
         except EOFError:
             return
         try:
@@ -568,19 +552,15 @@ class _MethodServer:
     _known: Any
     _instance: Any
 
-    def load(self, track: str, id: str, kwargs: dict[str, Any], method: str, entry: np.ndarray,
-             **files: np.ndarray) -> dict[str, Any]:
+    def load(self, track: str, id: str, kwargs: dict[str, Any], method: str,
+             entry: np.ndarray) -> dict[str, Any]:
         """Load the method and return the attributes of its class."""
         import gymnasium as gym
         if entry.size:  # unpickling is safe: the parent process sent it
             import_entries([cloudpickle.loads(entry.tobytes())])
-        if files:
-            self._file = Path.home() / "method" / method
-            self._file.parent.mkdir()
-        for name, content in files.items():
-            self._file.with_name(name.removeprefix("file:")).write_bytes(content.tobytes())
         env: Any = gym.make(id, disable_env_checker=True, **kwargs).unwrapped
-        self._method = load_method(str(self._file) if files else method, track)
+        self._file = Path.home() / "method" / method
+        self._method = load_method(str(self._file) if self._file.is_file() else method, track)
         self._known = env.task if track == "estimation" else env.rules
         attributes = ("name", "title", "subtracks", "parameters", "role", "privileged")
         about = {name: getattr(self._method, name) for name in attributes}
@@ -612,9 +592,9 @@ class _MethodServer:
         message = f"{type(error).__name__}: {error}".replace(f"{self._file.parent}/", "")
         found = {"error": message, "where": error_location(error, self._file),
                  "traceback": user_traceback(error, self._file)}
-        return {key: _sendable(value, MAX_TEXT_CHARS) for key, value in found.items()}
+        return {key: _sendable(value) for key, value in found.items()}
 
 
-def _sendable(text: str, length: int = MAX_OUTPUT_CHARS) -> str:
+def _sendable(text: str) -> str:
     """Truncate a text, and replace lone surrogates, which UTF-8 cannot encode."""
-    return text[:length].encode(errors="replace").decode()
+    return text[:MAX_OUTPUT_CHARS].encode(errors="replace").decode()

@@ -6,17 +6,15 @@ import io
 import math
 from collections.abc import Collection, Iterable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from eitbench._files import write_atomically
 from eitbench.bench.scores import Outcome
+from eitbench.envs.measured import MeasuredEnv
 from eitbench.measured.segmentation import ktc_score, segment
-
-if TYPE_CHECKING:
-    from eitbench.envs.measured import MeasuredEnv
-    from eitbench.worlds.task import Estimate
+from eitbench.worlds.task import Estimate
 
 N_PLOTTED_FRAMES = 60
 
@@ -34,8 +32,7 @@ class MeasuredRun:
         self.nis = np.full(T, np.nan)
         """(T,) νᵀS⁻¹ν relative to the number of visible measurements; NaN without an innovation"""
         self.withheld_residual_rms = np.full(T, np.nan)
-        """(T,) RMS residual of withheld measurements relative to the noise; NaN in unscored
-        steps"""
+        """(T,) RMS residual of withheld measurements relative to the noise; NaN if unscored"""
         self.velocity = None if velocity is None else np.tile(velocity.nominal, (T, 1))
         """(T, k) m/s, parameters of the flow if estimated; nominal if the method returns none"""
         squares = np.full(T, np.nan)
@@ -76,13 +73,11 @@ class MeasuredRun:
         """(C,) s, start of some frames, evenly distributed"""
         self.electrode_residual_rms = electrodes.rms()
         """(C, L) RMS residual in a frame relative to the noise, over the measurements that involve
-        the electrode while it drives current (without any in all frames, over all that involve
-        it), of the estimate before each measurement; for a stationary target, of the last. NaN
-        without any."""
+        the electrode while it drives current (if there are any, else all that involve it), of the
+        estimate before each measurement, or of the last for a stationary target"""
         self.seconds_per_step = seconds / T
         self.withheld_rmse = _root_mean(self.withheld_residual_rms**2)
-        """RMS residual of all scored withheld measurements relative to the noise; NaN without
-        any"""
+        """RMS of all scored withheld residuals relative to the noise; NaN without any"""
         self.withheld_rmse_volts = _root_mean(squares)
         """the same in V"""
 
@@ -105,15 +100,12 @@ class MeasuredRun:
         """Write the run as npz atomically: ``steps`` (S,), ``mean`` and ``variance`` (S, n),
         ``nis`` and ``withheld_residual_rms`` (T,), ``velocity`` (T, k) if estimated, ``times``
         (T,) in s, and the mesh's ``points`` (n, d) in m and ``cells``."""
-        mesh = env.task.mesh
-        arrays: dict[str, Any] = {
-            "steps": self.steps, "mean": self.mean, "nis": self.nis,
-            "withheld_residual_rms": self.withheld_residual_rms,
-            "times": env.measurements.times, "points": mesh.points, "cells": mesh.cells}
-        arrays |= {name: value for name, value in (
-            ("variance", self.variance), ("velocity", self.velocity)) if value is not None}
+        names = ("steps", "mean", "variance", "nis", "withheld_residual_rms", "velocity")
+        arrays: dict[str, Any] = {name: getattr(self, name) for name in names
+                                  if getattr(self, name) is not None}
         content = io.BytesIO()
-        np.savez_compressed(content, **arrays)
+        np.savez_compressed(content, times=env.measurements.times, points=env.task.mesh.points,
+                            cells=env.task.mesh.cells, **arrays)
         write_atomically(path, content.getvalue())
 
 

@@ -29,13 +29,10 @@ LOADER_GROUP = "eitbench.loaders"
 the file's suffix and is called with path and content."""
 ROLES = (None, "floor", "reference")
 """Role of a method on a leaderboard: ranked, naive baseline, or oracle."""
-
 AGENT_FILES = ("config.json", "sha256")
 """Files in the folder of an agent's model.zip."""
 MAX_METHOD_BYTES = 1 << 28
-"""size of a method's file"""
 MAX_TITLE_CHARS = 120
-"""length of a title"""
 MAX_PARAMETERS_BYTES = 10_000
 """size of a method's parameters as JSON in a record"""
 AGENTS_NOT_BUNDLED = ("checkpoints of built-in agents are in a checkout only, not in an installed "
@@ -69,8 +66,7 @@ class Method(NamedTuple):
     name: str
     """Name of the file without its suffix; for an agent, algorithm and training seed."""
     title: str
-    """First line of its docstring, up to a colon, bracket or full stop, and at most
-    `MAX_TITLE_CHARS` characters; without a docstring the file's name."""
+    """See `title_of`."""
     path: Path
     sha256: str
     subtracks: tuple[str, ...]
@@ -91,8 +87,8 @@ class Method(NamedTuple):
         return version_of(self.path, self.sha256)
 
     def suits(self, world: Any) -> bool:
-        """Return whether it is compatible with a `Task` of its subtracks, or with `Rules`; a method
-        without a function ``suits`` is compatible with all."""
+        """Return whether it is compatible with a `Task` of its subtracks, or with `Rules`, as its
+        optional function ``suits`` determines."""
         suits = getattr(self.make, "suits", None)
         return suits is None or bool(suits(world))
 
@@ -102,12 +98,8 @@ def baseline_folder() -> Path:
     return bundled_path("baselines")
 
 
-def builtin_methods(track: str) -> list[str]:
-    """Return the names of the built-in methods of a track, without agents."""
-    return list(_builtin_paths(track))
-
-
-def _builtin_paths(track: str) -> dict[str, Path]:
+def builtin_methods(track: str) -> dict[str, Path]:
+    """Map names to files of the built-in methods of a track, without agents."""
     folder = baseline_folder() / METHOD_KINDS[track].folder
     return {path.stem: path for path in sorted(folder.glob("*.py"))}
 
@@ -127,7 +119,7 @@ def builtin_agents(id: str) -> list[str]:
 def builtin_files(id: str) -> dict[str, Path]:
     """Map the names of results to the files of all built-in methods and of the agents of an
     environment; checkpoints of agents may be missing."""
-    return (_builtin_paths("estimation") | _builtin_paths("injection")
+    return (builtin_methods("estimation") | builtin_methods("injection")
             | {f"{path.parents[1].name}_{path.parent.name}": path for path in _agents(id)})
 
 
@@ -214,13 +206,12 @@ def method_files(path: Path) -> dict[str, bytes]:
     names in ``files = ("weights.npz",)``, or that `eitbench.rl.save_agent` writes with a model.
 
     The source is parsed, not executed. ``ValueError`` if a named file is not in the folder."""
-    source = _content(path)
+    contents = {path.name: _content(path)}
     if path.suffix != ".py":
-        return {path.name: source} | {name: path.with_name(name).read_bytes()
-                                      for name in AGENT_FILES if path.with_name(name).is_file()}
-    contents = {path.name: source}
+        return contents | {name: path.with_name(name).read_bytes()
+                           for name in AGENT_FILES if path.with_name(name).is_file()}
     try:
-        names = _class_attribute(source, "files", ())
+        names = _class_attribute(contents[path.name], "files", ())
     except SyntaxError:             # loading reports the error
         names = ()
     except ValueError:              # not a literal
@@ -259,7 +250,8 @@ def builtin_summary(name: str, track: str) -> tuple[str, tuple[str, ...]]:
 
 
 def title_of(docstring: str | None, name: str) -> str:
-    """Return the title in a method's docstring, see `Method`; its name without one."""
+    """Return the title in a method's docstring: its first line up to a colon or full stop, at most
+    `MAX_TITLE_CHARS` characters; the method's name without one."""
     paragraph = " ".join((docstring or "").strip().split("\n\n")[0].split())
     return re.split(r"[.:](?:\s|$)", paragraph)[0][:MAX_TITLE_CHARS].strip() or name
 
@@ -279,7 +271,7 @@ def find_method(name: str, track: str) -> Path:
     """Return the file of a method by its name, if it is built in or installed, or by its path.
     ``ValueError`` if the file is missing, or has the name of another method."""
     form = METHOD_KINDS[track]
-    own = _builtin_paths(track)
+    own = builtin_methods(track)
     if is_path(name):
         path = resolve_input(Path(name))
     else:
@@ -344,10 +336,9 @@ def method_from_attributes(track: str, name: str, who: str, make: Callable[..., 
             or any(each not in SUBTRACKS[track] for each in subtracks)):
         raise ValueError(f"{who}.subtracks must be some of {', '.join(SUBTRACKS[track])}, got "
                          f"{subtracks!r}")
-    role = given.get("role")
+    role, privileged = given.get("role"), given.get("privileged", False)
     if role not in ROLES:
         raise ValueError(f"{who}.role must be among {', '.join(map(repr, ROLES))}; got {role!r}")
-    privileged = given.get("privileged", False)
     if not isinstance(privileged, bool):
         raise ValueError(f"{who}.privileged must be True or False, got {privileged!r}")
     parameters = given.get("parameters", {})
@@ -359,8 +350,7 @@ def method_from_attributes(track: str, name: str, who: str, make: Callable[..., 
 
 
 def load_module(kind: str, path: Path, source: bytes) -> ModuleType:
-    """Execute a file's content as a module; ``ValueError``, naming ``kind`` and path, if that
-    fails."""
+    """Execute a file's content as a module; ``ValueError``, naming kind and path, if it fails."""
     name = f"eitbench_{kind}_{path.stem}"
     specification = importlib.util.spec_from_file_location(name, path)
     assert specification is not None

@@ -9,6 +9,7 @@ import gymnasium as gym
 import numpy as np
 from tqdm import tqdm
 
+from eitbench import __version__
 from eitbench._extras import require_extra
 from eitbench.bench.methods import Method, load_method
 from eitbench.bench.runner import policy_generator
@@ -36,10 +37,7 @@ Simulated by eitbench {version}; no measured data, no personal data. Licence: MI
 
 def export_minari(name: str, env: str, policy: str, seeds: str | Sequence[int], *,
                   n_jobs: int = 1, backend: str = "loky") -> int:
-    """Run a policy, write its episodes to Minari's data folder, and return their number.
-
-    All episodes are written at the end: an interrupted export leaves only cached simulated
-    episodes, and must be started again.
+    """Run a policy, write its episodes at the end to Minari's data folder, and return their number.
 
     ``name`` is the name of the data set, e.g. ``eitbench/pipe2d/random-pair-v0``; ``env`` the id of
     an injection environment; ``policy`` a built-in name, or the path of a file, which runs in this
@@ -60,14 +58,17 @@ def export_minari(name: str, env: str, policy: str, seeds: str | Sequence[int], 
     presimulate(inner.world, numbers, n_jobs=n_jobs, backend=backend)
     episodes = [_run(made, method, seed, k) for k, seed in enumerate(
         tqdm(numbers, desc="running", unit="episode", disable=None))]
+    description = DESCRIPTION.format(
+        env=env, policy=method.name, title=method.title, version=__version__,
+        seeds=seed_ranges(map(format_seed, numbers)),
+        warning=WARNING if any(map(is_test, numbers)) else "").strip()
     returns = {row["group"]: float(row["mean"]) for row in published_returns(env)}
     # the id: the spec of an environment that was made has an episode limit, which would truncate
     create_dataset_from_buffers(name, episodes, env=env, eval_env=env, algorithm_name=method.name,
                                 author="The eitbench authors", requirements=["eitbench"],
                                 ref_min_score=returns.get("random"),
                                 ref_max_score=max(returns.values(), default=None),
-                                num_episodes_average_score=N_EPISODES,
-                                description=_description(env, method, numbers))
+                                num_episodes_average_score=N_EPISODES, description=description)
     return len(episodes)
 
 
@@ -92,20 +93,11 @@ def _run(env: gym.Env[Any, Any], policy: Method, seed: int, number: int) -> Epis
         observations = [env.reset(seed=seed)[0]]
     player = policy.make(inner.rules, policy_generator(seed), *[inner.core] * policy.privileged)
     steps: list[tuple[Any, ...]] = []
-    ended = False
-    while not ended:
+    while not steps or not any(steps[-1][2:]):                  # terminated or truncated
         raw = {name: array[0] for name, array in inner.core.observe().items()}
         action = player.act(raw)
-        observation, reward, terminated, truncated, _ = env.step(action)
+        observation, *rest, _ = env.step(action)
         observations.append(observation)
-        steps.append((action, reward, terminated, truncated))
-        ended = terminated or truncated
+        steps.append((action, *rest))
     columns = map(np.array, zip(*steps, strict=True))  # in the buffer's order
     return EpisodeBuffer(number, seed, None, np.array(observations), *columns, infos={})
-
-
-def _description(env: str, policy: Method, seeds: Sequence[int]) -> str:
-    from eitbench import __version__
-    return DESCRIPTION.format(
-        env=env, policy=policy.name, title=policy.title, seeds=seed_ranges(map(format_seed, seeds)),
-        version=__version__, warning=WARNING if any(map(is_test, seeds)) else "").strip()

@@ -24,17 +24,13 @@ def _files(registered: Entry) -> Iterator[File]:
     yield scoring_constants_file(world)
     if world.region is not None:
         yield region_file(world)
-    needed = max(_needed_steps(each) for each in entries().values()
-                 if each.world.truth_config == world.truth_config)
+    # number of steps that the first observation of an environment of this truth needs
+    needed = max(1 + (each.track == "injection") * len(each.world.currents)
+                 for each in entries().values() if each.world.truth_config == world.truth_config)
     if needed <= world.warm_up:
         yield prefix_file(world, needed)
     if registered.track == "injection" and not isinstance(world.target, MovingBody):
         yield File(reduced_model_key(world), lambda: build_packed_model(world.fault_free))
-
-
-def _needed_steps(registered: Entry) -> int:
-    """Return the number of steps of an episode that the first observation needs."""
-    return 1 + (registered.track == "injection") * len(registered.world.currents)
 
 
 def write_package_data() -> Iterator[str]:

@@ -1,13 +1,8 @@
 """Records: the reproducible scores of one version of a method in one environment, as JSON.
 
-A record holds the version of a method, the version of a world (the -vN of its id), the seeds, and
-the scores of each episode. Commit and machine of each run are informative only.
-
 The format is published in ``leaderboards/schema.json``, and a record is checked against it when it
-is written and when it is read. The record includes the sha256 of its content, which reveals
-accidental changes. Self-reported numbers are verified by rerunning the method.
-
-An installed package holds the scores of all published records in one table
+is written and when it is read. It includes the sha256 of its content, which reveals accidental
+changes. An installed package holds the scores of all published records in one table
 (`eitbench.bench.episode_table`) in place of the records.
 """
 
@@ -19,9 +14,8 @@ import math
 import re
 import warnings
 from collections.abc import Iterable, Iterator
-from contextlib import suppress
 from functools import lru_cache
-from itertools import islice
+from itertools import filterfalse, islice
 from pathlib import Path
 from typing import Any
 
@@ -40,7 +34,6 @@ COMMON_FIELDS = ("environment", "method", "board", "title", "parameters", "role"
                  "version", "method_sha256", "checkpoint_sha256")
 """Fields that all episodes of a record share."""
 MAX_BYTES = 2**23
-"""size of a file"""
 MAX_RECORD_DEPTH = 32
 """levels of nested lists and objects"""
 MAX_KWARGS_CHARS = 10_000
@@ -53,16 +46,14 @@ _BUILTIN_VERSION = re.compile(r"v([1-9][0-9]*)")
 
 def write_record(folder: Path, record: dict[str, Any]) -> Path:
     """Write a record into ``folder`` atomically and return its path; a file of the same name is
-    replaced. ``ValueError``, naming file and fields, if it breaks the schema."""
+    replaced. ``ValueError``, naming method and fields, if it breaks the schema."""
     record = with_content_hash(record)
-    name = "(nameless)"
-    with suppress(KeyError, TypeError):               # the check names the missing field
-        name = record_file_name(record)
-    path = Path(folder) / name
     try:
         check_record(record)
     except ValueError as error:
-        raise ValueError(f"record {sanitize(str(path))} {sanitize(str(error))}") from None
+        name = sanitize(str(record.get("method")))
+        raise ValueError(f"record of {name} {sanitize(str(error))}") from None
+    path = Path(folder) / record_file_name(record)
     write_atomically(path, _text(record).encode())
     return path
 
@@ -100,19 +91,17 @@ def read_json(path: Path) -> Any:
     return content
 
 
-def read_records(folder: Path) -> list[dict[str, Any]]:
-    """Read all records of a folder, sorted by file name; an empty list if the folder is missing.
-    Records of an environment that is not registered in that version are skipped with a warning.
+def read_records(folder: Path, *, measured: bool | None = False) -> list[dict[str, Any]]:
+    """Read all records of a folder, sorted by file name, as `read_valid_files`; none if it is
+    missing. ``ValueError``, naming all invalid records.
 
-    If the folder is missing, but the table of its episodes exists next to it, as in an installed
-    package, the records come from the table, without runs and errors of single steps.
-
-    ``ValueError``, naming all invalid records; see `read_record`.
+    If only the table of its episodes exists, as in an installed package, the records come from it,
+    without runs and errors of single steps.
     """
     folder = Path(folder)
     if not folder.is_dir() and (table := table_path(folder)).is_file():
         return read_episode_table(table)
-    records, complaints = read_valid_files(folder)
+    records, complaints = read_valid_files(folder, measured=measured)
     if complaints:
         raise ValueError("; ".join(complaints))
     return list(records.values())
@@ -121,7 +110,8 @@ def read_records(folder: Path) -> list[dict[str, Any]]:
 def read_valid_files(folder: Path, *, measured: bool | None = False,
                      ) -> tuple[dict[Path, dict[str, Any]], list[str]]:
     """Return path -> record for the valid records of a folder, and an error message for each other
-    file: of measured cases, of all others (False), or of both (None)."""
+    file: of measured cases, of all others (False), or of both (None). Records of an environment
+    that is not registered in that version are skipped with a warning."""
     valid = {}
     complaints = []
     known = {*tracks.measured_ids(), *tracks.ids()}
@@ -164,15 +154,11 @@ def _digest(record: dict[str, Any]) -> str:
 
 
 def _text(record: dict[str, Any]) -> str:
-    """Format JSON with sorted keys and one line for each field, episode and run, which makes
-    differences readable."""
-    lines = []
-    for key, value in sorted(record.items()):
-        if key in ("episodes", "runs"):
-            lines.append(f" {_json(key)}: [\n  " + ",\n  ".join(map(_json, value)) + "\n ]")
-        else:
-            lines.append(f" {_json(key)}: {_json(value)}")
-    return "{\n" + ",\n".join(lines) + "\n}\n"
+    """Format JSON with sorted keys and one line for each field, episode and run."""
+    lines = {key: _json(value) for key, value in sorted(record.items())}
+    for key in ("episodes", "runs"):
+        lines[key] = "[\n  " + ",\n  ".join(map(_json, record[key])) + "\n ]"
+    return "{\n" + ",\n".join(f" {_json(key)}: {text}" for key, text in lines.items()) + "\n}\n"
 
 
 def _json(value: Any, **how: Any) -> str:
@@ -217,24 +203,17 @@ def split_outdated(records: list[dict[str, Any]],
     record is superseded only by a higher official one. All versions of third-party methods, which
     have no order, are current.
     """
-    versions: dict[tuple[str, ...], list[tuple[int, bool]]] = {}
-    for record in records:
-        versions.setdefault(_lineage(record), []).append(
-            (version_number(record["version"]) or 0, record["official"]))
-
-    def is_outdated(record: dict[str, Any]) -> bool:
-        number = version_number(record["version"])
-        return number is not None and any(
-            other > number and (official or not record["official"])
-            for other, official in versions[_lineage(record)])
-
-    return ([record for record in records if not is_outdated(record)],
-            [record for record in records if is_outdated(record)])
-
-
-def _lineage(record: dict[str, Any]) -> tuple[str, ...]:
-    """Return the fields that all versions of one method share."""
-    return record["environment"]["name"], record["method"], record["split"]
+    numbered = [((record["environment"]["name"], record["method"], record["split"]),
+                 version_number(record["version"]) or 0, record) for record in records]
+    newest: dict[Any, int] = {}
+    for key, number, record in numbered:
+        for is_official in {record["official"], False}:
+            newest[key, is_official] = max(number, newest.get((key, is_official), 0))
+    current, outdated = list[dict[str, Any]](), list[dict[str, Any]]()
+    for key, number, record in numbered:
+        is_outdated = 0 < number < newest[key, record["official"]]
+        (outdated if is_outdated else current).append(record)
+    return current, outdated
 
 
 # -- checks -------------------------------------------------------------------------------------
@@ -248,12 +227,11 @@ def _validator() -> Any:
 
 def check_record(record: Any) -> None:
     """Raise ``ValueError``, naming fields, if a record breaks the schema or is inconsistent."""
-    if not _validator().is_valid(record):
-        errors = islice(_validator().iter_errors(record), 20)
-        wrong = sorted(f"{_place(error.instance_path)}: {_shortened(error.message)}"
-                       for error in errors)
-    else:
+    if _validator().is_valid(record):
         wrong = list(_contradictions(record))
+    else:
+        wrong = sorted(f"{_place(error.instance_path)}: {_shortened(error.message)}"
+                       for error in islice(_validator().iter_errors(record), 20))
     if wrong:
         raise ValueError("is not valid: " + "; ".join(map(_shortened, wrong[:5])))
 
@@ -276,7 +254,12 @@ def _contradictions(record: dict[str, Any]) -> Iterator[str]:
         yield "$.version: must be v1, v2, … or the first eight digits of method_sha256"
     if record["official"] and any(run["commit"] is None or run["dirty"] for run in record["runs"]):
         yield "$.official: must be false unless all runs are of a commit without changes"
-    yield from _of_the_seeds(record)
+    if record["seeds"] != [episode["seed"] for episode in record["episodes"]]:
+        yield "$.seeds: must be the seeds of the episodes, in the same order"
+    if {split_of(seed) for seed in record["seeds"]} != {record["split"]}:
+        yield f"$.seeds: must all be of the split {record['split']}"
+    for seed in filterfalse(_is_seed, record["seeds"]):
+        yield f"$.seeds: {sanitize(seed)[:40]!r} is not an episode seed"
     yield from _of_the_episodes(record)
 
 
@@ -298,16 +281,6 @@ def _of_the_environment(record: dict[str, Any]) -> Iterator[str]:
         return
     if record["board"] != board:
         yield f"$.board: must be {board}, as the environment requires"
-
-
-def _of_the_seeds(record: dict[str, Any]) -> Iterator[str]:
-    if record["seeds"] != [episode["seed"] for episode in record["episodes"]]:
-        yield "$.seeds: must be the seeds of the episodes, in the same order"
-    for seed in record["seeds"]:
-        if not _is_seed(seed):
-            yield f"$.seeds: {sanitize(seed)[:40]!r} is not an episode seed"
-    if {split_of(seed) for seed in record["seeds"]} != {record["split"]}:
-        yield f"$.seeds: must all be of the split {record['split']}"
 
 
 @lru_cache(maxsize=2**14)

@@ -1,5 +1,4 @@
-"""Jobs: methods, environments and seeds, with their defaults. The result of each episode is stored
-when it finishes."""
+"""Jobs: methods, environments and seeds, with their defaults, and runs that store each result."""
 
 from __future__ import annotations
 
@@ -61,8 +60,7 @@ class Job(NamedTuple):
     """Name or path."""
     seed: int
     isolation: str = "none"
-    """``none``, or the kind of worker process that executes the method's file: ``process`` or
-    ``bubblewrap``."""
+    """``none``, or the kind of worker that executes the file: ``process`` or ``bubblewrap``."""
 
     def load(self) -> Method:
         """Load the method."""
@@ -100,9 +98,9 @@ def make_jobs(track: str, environments: list[str], methods: list[str],
 
     The ``suite``, quick or full, determines the default environments and seeds. Each environment
     has a variant for each of ``worlds`` (the argument ``world`` of `gymnasium.make`); injection
-    environments have the filter ``estimator``. ``isolate`` and ``strict`` are as in
-    `isolation.choose_isolation`. ``ValueError`` if an environment or method is unknown, a given
-    method is compatible with none of the environments, or two methods have the same name.
+    environments have the filter ``estimator``. ``isolate`` and ``strict`` as in `choose_isolation`.
+    ``ValueError`` if an environment or method is unknown, a given method is compatible with none of
+    the environments, or two methods have the same name.
     """
     _check.choice("estimator", estimator, tracks.ONBOARD_FILTERS)
     given = {} if estimator == "full" else {"estimator": estimator}
@@ -153,12 +151,9 @@ def isolated_job(environment: Environment, method: str, isolate: str,
 
 
 def run_episode(job: Job) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    """Run and score one episode.
-
-    Returns its result, JSON-ready (status "ok" with scores and the error of every scored step, or
-    "failed" with a message, file and line, and the traceback of the method's file), and the
-    estimates' means and standard deviations (float32; empty for policies and after a failure).
-    """
+    """Run and score one episode. Return its result, JSON-ready (status "ok" with scores and the
+    error of every scored step, or "failed" with a message, file and line, and traceback), and the
+    estimates' means and standard deviations (float32; empty for policies and after a failure)."""
     method = job.load()
     result = _initial_result(job, method)
     fields: dict[str, np.ndarray] = {}
@@ -171,7 +166,7 @@ def run_episode(job: Job) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
         if played.actions is not None:
             scores["actions"] = played.actions
         json.dumps(scores, allow_nan=False)  # a result that cannot be stored is a failure
-        result |= {"status": "ok"} | scores
+        result |= {"status": "ok", **scores}
         fields = played.fields
     # an exception of a method becomes its result
     except (Exception, SystemExit) as error:

@@ -7,7 +7,7 @@ import json
 import time
 from collections.abc import Collection, Iterable, Iterator
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from threadpoolctl import threadpool_limits
@@ -24,6 +24,7 @@ from eitbench.data.episodes import cached_truth_model, simulate
 from eitbench.data.seeds import allow_test_seeds
 from eitbench.envs.estimation import EstimationEnv
 from eitbench.envs.injection import InjectionEnv
+from eitbench.envs.measured import MeasuredEnv
 from eitbench.estimation import best_homogeneous
 from eitbench.physics.cross_section import outlet_of
 from eitbench.physics.transport import ConvectionDiffusion
@@ -31,9 +32,6 @@ from eitbench.worlds.random_streams import episode_streams, generator_from_state
 from eitbench.worlds.registry import entry
 from eitbench.worlds.task import Estimate, Task
 from eitbench.worlds.world import World
-
-if TYPE_CHECKING:
-    from eitbench.envs.measured import MeasuredEnv
 
 Step = tuple[int, Estimate | None, dict[str, np.ndarray], float]
 """t of the estimate, the estimate, the last voltages and currents, and the computing time in s."""
@@ -46,8 +44,8 @@ class EpisodeRun(NamedTuple):
     currents: np.ndarray
     """(steps, L) A (A/m in 2D), injected currents of each step"""
     fields: dict[str, np.ndarray]
-    """Means and standard deviations of an estimator's estimates as float32, for figures; empty for
-    policies and on measurements."""
+    """Means and standard deviations of estimates as float32, for figures; empty for policies and on
+    measurements."""
     actions: list[Any] | None = None
     """actions of a policy, JSON-ready"""
     episode_return: float | None = None
@@ -100,13 +98,10 @@ def run_on_measurements(env: MeasuredEnv, method: str | Method, seed: int = 0, *
     """
     if isinstance(method, str):
         method = load_method(method, "estimation")
-    if "filter" not in method.subtracks:
-        raise ValueError("method must estimate the present state, as in filtering, got "
-                         f"{method.name} for {', '.join(method.subtracks)}")
     env.reset(seed=seed)                            # sets the task before the time measurement
-    if not method.suits(env.task):
-        raise ValueError("method must suit vessel, flow and target of the measurements, got "
-                         f"{method.name}")
+    if "filter" not in method.subtracks or not method.suits(env.task):
+        raise ValueError("method must be a filter and must suit vessel, flow and target of the "
+                         f"measurements, got {method.name} for {', '.join(method.subtracks)}")
     with threadpool_limits(1):
         steps = tqdm(_iter_steps(env, method, seed), total=env.episode_steps, desc=method.name,
                      unit="measurement", disable=None, leave=False)
@@ -187,8 +182,8 @@ class EstimatorOutput:
         steps = range(task.warm_up + 1, task.n_steps + 1)
         innovations = None
         if all(i in self.innovations for i in steps):
-            innovations = (np.array([self.innovations[i][0] for i in steps]),
-                           np.array([self.innovations[i][1] for i in steps]))
+            vectors, covariances = zip(*(self.innovations[i] for i in steps), strict=True)
+            innovations = np.array(vectors), np.array(covariances)
         return Outcome(
             env.world, sum(self.seconds) / task.n_steps, scoring.step_errors(mean, truth, mass),
             mean=mean, truth=truth, mass=mass,
@@ -201,33 +196,29 @@ class EstimatorOutput:
 def _solute_flow(env: EstimationEnv, states: np.ndarray, means: np.ndarray,
                  velocities: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
     """Return the estimated and the true flow of solute through the outlet (S,) in mol/s, for the
-    true ``states`` (S, n_truth) that are scored, their estimates (S, n) and flow parameters (S, k);
-    None without a flow through the vessel.
-    """
+    scored ``states`` (S, n_truth), their estimates (S, n) and flow parameters (S, k); None without
+    a flow through the vessel."""
     task, world = env.task, env.world
     model, truth = task.transport, cached_truth_model(world).transport
     if not (isinstance(model, ConvectionDiffusion) and isinstance(truth, ConvectionDiffusion)
             and model.inlet.size):
         return None
     drawn = world.flow.draw(world, episode_streams(env.core.seeds[0]).flow)
-    outlet = outlet_of(model)
+    outlet, true_outlet = outlet_of(model), outlet_of(truth)
     estimated = [outlet.solute_flow(mean, task.velocity.field(parameters) if task.velocity
                                     else model.velocity)
                  for mean, parameters in zip(means, velocities, strict=True)]
-    outlet = outlet_of(truth)
-    first = task.warm_up + 1
-    true = [outlet.solute_flow(concentration, drawn(t) if drawn else truth.velocity)
-            for t, concentration in enumerate(states, first)]
+    true = [true_outlet.solute_flow(concentration, drawn(t) if drawn else truth.velocity)
+            for t, concentration in enumerate(states, task.warm_up + 1)]
     return np.array(estimated), np.array(true)
 
 
 def _run_policy(env: InjectionEnv, policy: Method, seed: int) -> EpisodeRun:
-    seconds = 0.0
+    seconds = total = 0.0
     currents = list[np.ndarray]()
     actions = list[Any]()
     scored = list[tuple[Any, ...]]()
     # `iter_injections` does not measure the time of this loop's body
-    total = 0.0
     for t, observation, elapsed, action, reward in iter_injections(env, policy, seed):
         seconds += elapsed
         total += reward
@@ -253,8 +244,7 @@ def _run_policy(env: InjectionEnv, policy: Method, seed: int) -> EpisodeRun:
         n_injections=sum(bool(each.any()) for each in currents),
         mean=(interpolation @ np.array(mean).T).T, std=(interpolation @ np.array(std).T).T,
         truth=simulate(world, seed, progress=False).concentration[list(states)].astype(float),
-        mass=mass, points=truth_mesh(world).points, distances=distances,
-        ospa=ospa,
+        mass=mass, points=truth_mesh(world).points, distances=distances, ospa=ospa,
         innovations=([each.value for each in used],
                      [each.covariance for each in used]) if used else None)
     return EpisodeRun(outcome, np.array(currents), {}, actions, total)
@@ -304,14 +294,15 @@ def _iter_steps(env: EstimationEnv | MeasuredEnv, estimator: Method, seed: int,
     """Yield (t = i − lag, estimate, measurement i, computing time in s) at each step i."""
     with allow_test_seeds():
         observation, _ = env.reset(seed=seed)
-    if estimator.privileged and not isinstance(env, EstimationEnv):
-        raise ValueError(f"{estimator.name} needs the ground truth, which measurements do not have")
-    shown = (env.task, env.privileged_info()) \
-        if isinstance(env, EstimationEnv) and estimator.privileged else (env.task,)
+    shown: list[Any] = [env.task]
+    if estimator.privileged:
+        if not isinstance(env, EstimationEnv):
+            raise ValueError(f"{estimator.name} needs the ground truth, which measurements lack")
+        shown.append(env.privileged_info())
     begin = time.perf_counter()
     player = estimator.make(*shown)
     setup = time.perf_counter() - begin
-    silence = np.full(env.task.mesh.n_nodes, env.task.expected_concentration)
+    silence = Estimate(np.full(env.task.mesh.n_nodes, env.task.expected_concentration))
     t = -env.task.lag
     done = False
     while not done:
@@ -328,52 +319,44 @@ def _iter_steps(env: EstimationEnv | MeasuredEnv, estimator: Method, seed: int,
             _check_estimate(estimate, env.task, np.isfinite(seen["voltages"]))
             if estimate.variance is not None and isinstance(env, EstimationEnv):
                 env.core.estimate_std = np.sqrt(estimate.variance)
-        observation, _, done, _, _ = env.step(_action(env.task, estimate, silence))
+        answer = silence if estimate is None else estimate
+        action = answer.mean
+        if (flow := env.task.velocity) is not None:
+            action = np.append(action, flow.nominal if answer.velocity is None else answer.velocity)
+        observation, _, done, _, _ = env.step(action)
         yield t, estimate, seen, seconds
-
-
-def _action(task: Task, estimate: Estimate | None, silence: np.ndarray) -> np.ndarray:
-    """Return the environment's action; the flow is nominal if the estimator returns none."""
-    mean = silence if estimate is None else estimate.mean
-    if task.velocity is None:
-        return mean
-    velocity = None if estimate is None else estimate.velocity
-    return np.concatenate([mean, task.velocity.nominal if velocity is None else velocity])
 
 
 def _check_estimate(estimate: Any, task: Task, measured: np.ndarray) -> None:
     """Check an estimate; the innovation may be NaN where ``measured`` (m,) is false."""
-    n = task.mesh.n_nodes
     if not isinstance(estimate, Estimate):
         raise ValueError("Estimator.update must return an Estimate or None, got "
                          f"{type(estimate).__name__}")
-    _check.array("Estimate.mean", estimate.mean, (n,), units="mol/m³")
-    variance, innovation, covariance, velocity, velocity_variance = estimate[1:]
-    for name, value in (("velocity", velocity), ("velocity_variance", velocity_variance)):
-        if value is not None:
-            if task.velocity is None:
-                raise ValueError(f"Estimate.{name} must be None where the flow is not estimated, "
-                                 f"got {value!r}")
-            _check.array(f"Estimate.{name}", value, (task.velocity.n_parameters,))
-    if innovation is not None:
-        innovation = _check.array("Estimate.innovation", innovation, measured.shape, units="V",
-                                  allow_nan=not measured.all())
-        if np.isnan(innovation[measured]).any():
-            raise ValueError("Estimate.innovation must be finite where a voltage was measured, got "
-                             "NaN")
-    if covariance is not None:
-        _check_covariance(covariance, len(measured))
-    if variance is not None and not (np.shape(variance) == (n,) and np.isfinite(variance).all()
-                                     and (np.asarray(variance) >= 0).all()):
-        raise ValueError(f"Estimate.variance must be finite, ≥ 0 and of shape ({n},), got shape "
-                         f"{np.shape(variance)}")
-
-
-def _check_covariance(covariance: Any, size: int) -> None:
-    _check.array("Estimate.innovation_covariance", covariance, (size, size), units="V²")
-    given = np.asarray(covariance, float)
-    spectrum = np.linalg.eigvalsh(0.5 * given + 0.5 * given.T)
-    # else νᵀS⁻¹ν could be negative
-    if spectrum[0] <= size * np.finfo(float).eps * spectrum[-1]:
-        raise ValueError("Estimate.innovation_covariance must be positive definite, got "
-                         f"eigenvalues from {spectrum[0]:g} to {spectrum[-1]:g} V²")
+    n, m = task.mesh.n_nodes, len(measured)
+    k = 0 if task.velocity is None else task.velocity.n_parameters
+    given: dict[str, np.ndarray] = {}
+    for name, shape, units in (
+            ("mean", (n,), "mol/m³"), ("variance", (n,), "(mol/m³)²"), ("innovation", (m,), "V"),
+            ("innovation_covariance", (m, m), "V²"), ("velocity", (k,), "m/s"),
+            ("velocity_variance", (k,), "(m/s)²")):
+        value = getattr(estimate, name)
+        if value is not None and shape == (0,):
+            raise ValueError(f"Estimate.{name} must be None where the flow is not estimated, got "
+                             f"{value!r}")
+        if value is not None or name == "mean":
+            given[name] = _check.array(
+                f"Estimate.{name}", value, shape, units=units,
+                allow_nan=name == "innovation" and not measured.all())
+    if "variance" in given and (given["variance"] < 0).any():
+        raise ValueError("Estimate.variance must be at least 0 (mol/m³)², got "
+                         f"{given['variance'].min():g}")
+    if "innovation" in given and np.isnan(given["innovation"][measured]).any():
+        raise ValueError("Estimate.innovation must be finite where a voltage was measured, got "
+                         "NaN")
+    if "innovation_covariance" in given:
+        covariance = given["innovation_covariance"]
+        spectrum = np.linalg.eigvalsh(0.5 * covariance + 0.5 * covariance.T)
+        # else νᵀS⁻¹ν could be negative
+        if spectrum[0] <= m * np.finfo(float).eps * spectrum[-1]:
+            raise ValueError("Estimate.innovation_covariance must be positive definite, got "
+                             f"eigenvalues from {spectrum[0]:g} to {spectrum[-1]:g} V²")

@@ -5,9 +5,9 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import lru_cache, wraps
+from functools import lru_cache
 from importlib.metadata import entry_points
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 
@@ -79,25 +79,6 @@ class Outcome:
         return np.asarray(self.mass.sum(axis=0)).ravel()
 
 
-_OLD_KEYWORDS = {"of": "compute", "better": "direction", "needs": "requires",
-                 "repeats": "deterministic"}
-_Class = TypeVar("_Class")
-
-
-def _accept_old_keywords(cls: type[_Class]) -> type[_Class]:
-    """Let packages that register scores pass the former names of the fields."""
-    initialise = cls.__init__
-
-    @wraps(initialise)
-    def __init__(self: Any, *args: Any, **fields: Any) -> None:
-        initialise(self, *args, **{_OLD_KEYWORDS.get(name, name): value
-                                   for name, value in fields.items()})
-
-    cls.__init__ = __init__  # type: ignore[method-assign]
-    return cls
-
-
-@_accept_old_keywords
 @dataclass(frozen=True)
 class Score:
     """A number computed from each episode; ``ValueError`` if a field is invalid."""
@@ -125,10 +106,10 @@ class Score:
             raise ValueError("name must be of lower-case letters, digits and underscores, got "
                              f"{self.name!r}")
         _check.choice("direction", self.direction, SCORE_DIRECTIONS)
-        for argument, values, allowed in (("requires", self.requires, Outcome.__dataclass_fields__),
-                                          ("tracks", self.tracks, KINDS)):
-            for each in values:
-                _check.choice(f"each of {argument}", each, allowed)
+        for each in self.requires:
+            _check.choice("each of requires", each, Outcome.__dataclass_fields__)
+        for each in self.tracks:
+            _check.choice("each of tracks", each, KINDS)
         _check.number("factor", self.factor, low=0.0, open_low=True)
 
     def __call__(self, outcome: Outcome) -> float | None:
@@ -143,12 +124,22 @@ class Score:
         return value if isinstance(value, int) else float(value)
 
 
+_initialise = Score.__init__
+
+
+def _accept_old_keywords(score: Score, *args: Any, **fields: Any) -> None:
+    """Initialise a score, also with the former names of its fields, as third-party packages do."""
+    names = {"of": "compute", "better": "direction", "needs": "requires",
+             "repeats": "deterministic"}
+    _initialise(score, *args, **{names.get(name, name): value for name, value in fields.items()})
+
+
+Score.__init__ = _accept_old_keywords  # type: ignore[assignment]
 _scores: dict[str, Score] = {}
 
 
 def register_score(score: Score) -> Score:
-    """Add a score to all episodes that run from now on. ``ValueError`` if its name or heading is in
-    use."""
+    """Add a score to all episodes from now on; ``ValueError`` if its name or heading is in use."""
     for other in _scores.values():
         if other.name == score.name or other.heading == score.heading:
             raise ValueError(f"score {score.name} ({score.heading}) has the name or heading of "
@@ -179,11 +170,6 @@ def compute_scores(track: str, outcome: Outcome) -> dict[str, float | None]:
     """Compute all scores of an episode of a track, or of measurements."""
     kind = "measured" if outcome.world is None else track
     return {name: each(outcome) for name, each in scores(kind).items()}
-
-
-def _contrast_error(outcome: Any) -> float:
-    return scoring.relative_error(outcome.mean, outcome.truth, outcome.mass,
-                                  reference=outcome.homogeneous)
 
 
 def _velocity_error(outcome: Any) -> float:
@@ -232,7 +218,9 @@ for _score in (
     Score("contrast_error", "contrast",
           "error relative to the deviation of the truth from the homogeneous estimate of the whole "
           "episode, which has 1",
-          _contrast_error, requires=("mean", "truth")),
+          lambda outcome: scoring.relative_error(outcome.mean, outcome.truth, outcome.mass,
+                                                 reference=outcome.homogeneous),
+          requires=("mean", "truth")),
     Score("nis", "NIS/m",
           "normalised innovation squared of all scored measurements; 1 if the filter's uncertainty "
           "is calibrated",

@@ -1,14 +1,10 @@
 """Statistics of a leaderboard: interquartile mean, bootstrap intervals, paired comparisons, ranks.
 
-Methods run on the same episodes, identified by their seeds, in several environments. Environments
-are strata: episodes are resampled within each environment. Intervals are 95 % percentile bootstrap
-intervals (Efron & Tibshirani, *An introduction to the bootstrap*, 1993, ch. 13), stratified as in
-Agarwal et al., "Deep reinforcement learning at the edge of the statistical precipice" (NeurIPS
-2021), and expanded with Student's t, as plain ones are too narrow for few episodes (Hesterberg,
-"What teachers should know about the bootstrap", The American Statistician 69, 2015, section 5.3).
-Scores are sorted, by value or by seed, before they are resampled, and the random stream is fixed:
-intervals do not depend on the process or on the order of the scores. `docs/statistics.md` defines
-the numbers.
+Methods run on the same episodes, identified by their seeds. Environments are strata, within which
+episodes are resampled. Intervals are 95 % percentile bootstrap intervals (Efron & Tibshirani, *An
+introduction to the bootstrap*, 1993, ch. 13), stratified as in Agarwal et al. (NeurIPS 2021), and
+expanded with Student's t (Hesterberg, The American Statistician 69, 2015, section 5.3). They depend
+neither on the process nor on the order of the scores. `docs/statistics.md` defines the numbers.
 
 `scipy.stats.bootstrap` has no strata and resamples for each statistic, which takes minutes for a
 leaderboard; here all methods of a leaderboard share one set of resamples.
@@ -35,29 +31,17 @@ Statistic = Callable[..., Any]
 """Maps one array (..., n_e) for each environment to (...), where ... are resamples."""
 N_RESAMPLES = 10_000
 ROUNDING = 1e-9
-"""Relative difference of means below which methods share a rank: their runs on different processors
-differ by rounding."""
+"""Relative difference of means below which methods share a rank, as processors round differently"""
 MIN_EPISODES = 6
-"""Number of episodes required for an interval. If all n differences have the same sign, so has each
-resample, and the interval excludes zero; for two equal methods the probability is 2^(1 − n), above
-5 % for n < 6."""
+"""Number n of episodes required for an interval: it excludes zero if all differences have the same
+sign, which for two equal methods has the probability 2^(1 − n), above 5 % for n < 6."""
 
 
 def interquartile_mean(*scores: ArrayLike) -> Any:
     """Average the middle half of all scores pooled: the 25 % trimmed mean (Agarwal et al. 2021).
 
-    The ⌊N/4⌋ lowest and the ⌊N/4⌋ highest of N scores are discarded. If 4 does not divide N,
-    slightly more than half remain, with equal weights.
-
-    Parameters
-    ----------
-    *scores : (..., n_e) each
-        One array for each environment. They are pooled along the last axis, so that the weight of
-        an environment is its number of episodes; all must have the same scale.
-
-    Returns
-    -------
-    (...) array; a number for arrays (n_e,).
+    ``scores`` (..., n_e), one array for each environment, are pooled along the last axis; the
+    result is (...). The ⌊N/4⌋ lowest and the ⌊N/4⌋ highest of N scores are discarded.
     """
     if not sum(np.shape(each)[-1] for each in scores):
         raise ValueError("scores must hold at least one score")
@@ -76,23 +60,17 @@ def mean_over_environments(*scores: ArrayLike) -> Any:
 
 def stratified_bootstrap(scores_by_stratum: Mapping[str, ArrayLike], statistic: Statistic, *,
                          n_resamples: int = N_RESAMPLES) -> tuple[float, float, float]:
-    """Compute a statistic and its 95 % bootstrap interval, resampling episodes within each
-    environment.
+    """Compute a statistic of environment -> scores (n_e,), and its 95 % bootstrap interval,
+    resampling episodes within each environment.
 
-    Parameters
-    ----------
-    scores_by_stratum : environment -> (n_e,)
-        The numbers of episodes may differ.
-    statistic : callable
-        Called with one array for each environment, in the order of their names: (n_e,) for the
-        value, and once for all resamples with (n_resamples, n_e). It must not depend on the order
-        of episodes; e.g. `interquartile_mean` and `mean_over_environments`.
+    ``statistic``, e.g. `interquartile_mean` or `mean_over_environments`, is called with one array
+    for each environment, in the order of their names: (n_e,) for the value, and once for all
+    resamples with (n_resamples, n_e). It must not depend on the order of episodes.
 
     Returns
     -------
     value, low, high
-        With fewer than `MIN_EPISODES` episodes altogether, or fewer than two in an environment,
-        low and high are infinite.
+        Without enough episodes for an interval (`has_enough_episodes`), low and high are infinite.
     """
     strata = [np.sort(np.asarray(scores_by_stratum[environment], dtype=float), axis=-1)
               for environment in sorted(scores_by_stratum)]
@@ -102,15 +80,12 @@ def stratified_bootstrap(scores_by_stratum: Mapping[str, ArrayLike], statistic: 
 
 def paired_difference(a: Scores, b: Scores, *, statistic: Statistic = mean_over_environments,
                       n_resamples: int = N_RESAMPLES) -> tuple[float, float, float]:
-    """Compute statistic(a) − statistic(b) on the episodes that both have, with its 95 % interval;
-    negative if a is lower.
+    """Compute statistic(a) − statistic(b) on the episodes that both have, with its 95 % interval.
 
-    Every resample has the same episodes for both, so the difficulty of an episode cancels, and far
-    smaller differences are significant than in a comparison of two intervals. The default is the
-    mean difference; for several environments the mean of their means. Exchanging a and b changes
-    the sign exactly. Seeds that only one of them has are ignored. Statistic and returned numbers as
-    in `stratified_bootstrap`; ``ValueError`` if the environments differ, or a and b share no seed
-    in one of them.
+    Every resample has the same episodes for both, so the difficulty of an episode cancels.
+    Exchanging a and b changes the sign exactly. Statistic and returned numbers as in
+    `stratified_bootstrap`; ``ValueError`` if the environments differ, or a and b share no seed in
+    one of them.
     """
     ours, theirs = _shared(a, b)
     drawn = [_resample(each, statistic, n_resamples) for each in (ours, theirs)]
@@ -119,11 +94,10 @@ def paired_difference(a: Scores, b: Scores, *, statistic: Statistic = mean_over_
 
 def paired_probability_of_improvement(a: Scores, b: Scores, *, higher_is_better: bool = False,
                                       ) -> tuple[float, float, float]:
-    """Compute the fraction of the shared episodes in which a is better than b, with its 95 %
-    interval; an equal score counts ½.
+    """Compute the fraction of the shared episodes in which a is better than b, averaged over the
+    environments, with its 95 % interval; an equal score counts ½.
 
-    The value is the mean of the environments' fractions. Pairing and errors as in
-    `paired_difference`; with too few episodes the interval is [0, 1].
+    Pairing and errors as in `paired_difference`; with too few episodes the interval is [0, 1].
     """
     sign = 1.0 if higher_is_better else -1.0
     wins = {str(i): 0.5 * (1.0 + sign * np.sign(ours - theirs))
@@ -139,12 +113,10 @@ def shared_ranks(scores: Mapping[str, Scores], *,
     better. Return method -> rank, in the order of the statistic, the best first.
 
     A method is significantly better if the interval of the `paired_difference` excludes zero on the
-    better side, by more than `ROUNDING`. Rank 1 means that no method is significantly better, rank
-    3 that two are. With too few episodes for an interval (`has_enough_episodes`), all ranks are 1.
-
-    The order by rank may differ from the order by the statistic. Each comparison is at 95 %,
-    without correction for the number of comparisons (``docs/statistics.md``). ``ValueError`` if the
-    methods did not run on the same episodes, or a score is not finite.
+    better side, by more than `ROUNDING`. With too few episodes for an interval
+    (`has_enough_episodes`), all ranks are 1. Each comparison is at 95 %, without correction for
+    their number (``docs/statistics.md``). ``ValueError`` if the methods did not run on the same
+    episodes, or a score is not finite.
     """
     if not scores:
         return {}
@@ -194,10 +166,7 @@ def _resample(strata: Sequence[np.ndarray], statistic: Statistic, n_resamples: i
 def _positions(sizes: tuple[int, ...], n_resamples: int) -> tuple[np.ndarray, ...]:
     """Draw the episodes of each resample: (n_resamples, n_e) for each stratum of n_e episodes."""
     random = np.random.default_rng(0)
-    positions = tuple(random.integers(n, size=(n_resamples, n)) for n in sizes)
-    for each in positions:
-        each.setflags(write=False)
-    return positions
+    return tuple(random.integers(n, size=(n_resamples, n)) for n in sizes)
 
 
 @lru_cache(maxsize=256)
@@ -205,9 +174,8 @@ def tail_percent(sizes: tuple[int, ...]) -> float:
     """Compute the percentage of resamples outside each end of a 95 % interval, from the number of
     episodes in each stratum.
 
-    The limit is 2.5. The correction is for the variance of resamples, which has the denominator n
-    instead of the n − E degrees of freedom with E strata, and for the normal quantile, which is
-    smaller than Student's.
+    The limit is 2.5, corrected for the variance of resamples, with the denominator n instead of the
+    n − E degrees of freedom of E strata, and for Student's t in place of the normal quantile.
     """
     n = sum(sizes)
     freedom = n - len(sizes)
@@ -220,8 +188,7 @@ def _interval(strata: Sequence[np.ndarray], values: np.ndarray) -> tuple[float, 
         return -math.inf, math.inf
     cut = tail_percent(tuple(map(len, strata)))
     # one interpolation for both ends, so that the ends for −values are the exact negatives
-    below, above = (np.percentile(side, cut) for side in (values, -values))
-    return float(below), 0.0 - float(above)
+    return float(np.percentile(values, cut)), 0.0 - float(np.percentile(-values, cut))
 
 
 def has_enough_episodes(strata: Sequence[np.ndarray]) -> bool:
@@ -238,8 +205,7 @@ def _check_strata(strata: Sequence[np.ndarray]) -> None:
 
 
 def _shared(*scores: Scores) -> list[list[np.ndarray]]:
-    """Return the scores (n_e,) of each method in each environment, sorted by name, on the seeds
-    that all methods share."""
+    """Return each method's scores (n_e,) in each environment, by name, on the shared seeds."""
     names = sorted(scores[0])
     if any(set(own) != set(names) for own in scores):
         raise ValueError("environments must be the same for all methods, got "

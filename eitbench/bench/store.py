@@ -23,44 +23,30 @@ from threadpoolctl import threadpool_limits
 
 from eitbench._files import PACKAGE, write_atomically
 from eitbench._sanitize import sanitize
-from eitbench.bench.records import (
-    COMMON_FIELDS,
-    SCHEMA,
-    check_record,
-    read_json,
-    read_records,
-    split_of,
-    with_content_hash,
-    write_record,
-)
+from eitbench.bench import records as stored
 from eitbench.bench.scores import SCORING
-from eitbench.data import cache
+from eitbench.data.cache import SIMULATION
 from eitbench.data.seeds import format_seed
 
 PACKAGES = ("eitbench", "numpy", "scipy", "gymnasium", "scikit-fem", "numba", "stable-baselines3",
             "sb3-contrib", "torch")
 """Packages whose versions are part of a record."""
+DECLARED_VERSIONS = {"simulation": str(SIMULATION), "scoring": str(SCORING)}
+"""Version numbers that developers raise when a change of the code changes scores of an episode."""
 _OPTION = re.compile(r"^(--?[\w-]+=|-[a-z])")
 """Name of an option that is joined to its value."""
 
 
 class EpisodeStore:
     """Episode results of a run in a folder: ``episodes/ENV/METHOD/SEED.json``, with the estimates
-    in ``SEED.npz``.
-
-    A result is a dictionary: the scores of one method in one episode, with environment, versions
-    and status ("ok" or a failure). Files are written atomically, so several runs may share a folder
-    and may be interrupted at any time.
-    """
+    in ``SEED.npz``. Files are written atomically, so several runs may share a folder and may be
+    interrupted at any time."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = Path(folder).absolute()           # workers may have other working folders
 
     def put(self, result: dict[str, Any], fields: dict[str, np.ndarray]) -> None:
-        """Store the ``result`` and the estimates ``fields`` of one episode.
-
-        The estimates are written first, so that each stored result has its estimates.
-        """
+        """Store the ``result`` of one episode, and before it the estimates ``fields``."""
         path = self._path(result["environment"]["name"], result["method"], result["seed"])
         if fields:
             content = io.BytesIO()
@@ -70,11 +56,10 @@ class EpisodeStore:
 
     def has_result(self, environment: str, method: str, seed: int, identity: str) -> bool:
         """Return whether a successful result with the cache key ``identity`` is stored."""
-        try:
+        with suppress(ValueError):
             result = self.result(environment, method, seed)
-        except ValueError:
-            return False
-        return result["identity"] == identity and result["status"] == "ok"
+            return bool(result["identity"] == identity and result["status"] == "ok")
+        return False
 
     def result(self, environment: str, method: str, seed: int) -> dict[str, Any]:
         """Return a stored result; ``ValueError`` if it is missing or damaged."""
@@ -98,16 +83,13 @@ class EpisodeStore:
 
     def fields(self, result: dict[str, Any]) -> dict[str, np.ndarray]:
         """Read the estimates of a result: ``mean`` and optionally ``std``, (T, n) in mol/m³ for T
-        states and n nodes.
-
-        ``std`` is NaN in states for which the method reported no variance. ``FileNotFoundError`` if
-        the file of estimates is missing; ``ValueError``, naming the file, if it is damaged.
-        """
+        states and n nodes; ``std`` is NaN in states without a variance. ``FileNotFoundError`` if
+        the file is missing; ``ValueError``, naming it, if it is damaged."""
         path = self._path(result["environment"]["name"], result["method"], result["seed"])
         path = path.with_suffix(".npz")
         try:
-            with np.load(path, allow_pickle=False) as stored:
-                fields = dict(stored)
+            with np.load(path, allow_pickle=False) as archive:
+                fields = dict(archive)
         except FileNotFoundError:
             raise
         # a damaged archive may raise zlib.error, NotImplementedError, RuntimeError, …
@@ -122,9 +104,9 @@ class EpisodeStore:
     def records(self, also: Iterable[dict[str, Any]] = ()) -> list[dict[str, Any]]:
         """Build one record per environment, method and split of the seeds, without validation.
 
-        Stored results are ignored if their method's file or `declared_versions` differ from the
-        most recent result. ``also`` are results of other records: if they have the same version of
-        the method, they replace missing and failed episodes.
+        Stored results are ignored if their method's file or `DECLARED_VERSIONS` differ from the
+        most recent result. ``also`` are results of other records, which replace missing and failed
+        episodes of the same version of the method.
         """
         own, others = _by_record(self.results()), _by_record(also)
         records = []
@@ -143,7 +125,7 @@ class EpisodeStore:
         written = []
         for record in self.records():
             try:
-                write_record(self.folder / "records", record)
+                stored.write_record(self.folder / "records", record)
             except ValueError as error:
                 warnings.warn(f"left out: {error}", stacklevel=2)
             else:
@@ -155,14 +137,12 @@ class EpisodeStore:
         return self.folder / "episodes" / environment.replace("/", "-") / method / name
 
 
-_Groups = dict[tuple[str, str, str], list[dict[str, Any]]]
-
-
-def _by_record(results: Iterable[dict[str, Any]]) -> _Groups:
+def _by_record(results: Iterable[dict[str, Any]],
+               ) -> dict[tuple[str, str, str], list[dict[str, Any]]]:
     """Group results by environment, method and split, as in records."""
-    groups: _Groups = {}
+    groups: dict[tuple[str, str, str], list[dict[str, Any]]] = {}
     for result in results:
-        key = (result["environment"]["name"], result["method"], split_of(result["seed"]))
+        key = (result["environment"]["name"], result["method"], stored.split_of(result["seed"]))
         groups.setdefault(key, []).append(result)
     return groups
 
@@ -174,7 +154,7 @@ def _latest(results: list[dict[str, Any]]) -> dict[str, Any]:
 def _code(result: dict[str, Any]) -> tuple[Any, ...]:
     """Return the sha256 of the method's file, and the declared versions."""
     versions = result["run"]["versions"]
-    return result["method_sha256"], *map(versions.get, declared_versions())
+    return result["method_sha256"], *map(versions.get, DECLARED_VERSIONS)
 
 
 def _gathered(results: list[dict[str, Any]]) -> dict[str, Any]:
@@ -187,22 +167,23 @@ def _gathered(results: list[dict[str, Any]]) -> dict[str, Any]:
             chosen[result["seed"]] = result
     # sort 9 before 10
     results = sorted(chosen.values(), key=lambda result: (len(result["seed"]), result["seed"]))
-    texts = [json.dumps(result["run"], sort_keys=True) for result in results]
-    runs = dict(zip(texts, (result["run"] for result in results), strict=True))
-    place = {run: i for i, run in enumerate(runs)}
-    return with_content_hash({
-        "schema": SCHEMA, "official": False, "split": split_of(latest["seed"]),
-        **{key: latest[key] for key in COMMON_FIELDS},
-        "seeds": [result["seed"] for result in results], "runs": list(runs.values()),
+    runs: list[dict[str, Any]] = []
+    for result in results:
+        if result["run"] not in runs:
+            runs.append(result["run"])
+    return stored.with_content_hash({
+        "schema": stored.SCHEMA, "official": False, "split": stored.split_of(latest["seed"]),
+        **{key: latest[key] for key in stored.COMMON_FIELDS},
+        "seeds": [result["seed"] for result in results], "runs": runs,
         "episodes": [{key: value for key, value in result.items()
-                      if key not in (*COMMON_FIELDS, "traceback")} | {"run": place[run]}
-                     for result, run in zip(results, texts, strict=True)],
+                      if key not in (*stored.COMMON_FIELDS, "traceback")}
+                     | {"run": runs.index(result["run"])} for result in results],
     })
 
 
 def record_results(record: dict[str, Any]) -> list[dict[str, Any]]:
     """Convert a record to episode results, as `EpisodeStore.results` yields them."""
-    shared = {key: record[key] for key in COMMON_FIELDS if key in record}
+    shared = {key: record[key] for key in stored.COMMON_FIELDS if key in record}
     runs = record.get("runs", [])
     return [episode | shared | ({"run": runs[episode["run"]]} if runs else {})
             for episode in record["episodes"]]
@@ -210,27 +191,21 @@ def record_results(record: dict[str, Any]) -> list[dict[str, Any]]:
 
 def folder_results(folder: Path) -> list[dict[str, Any]]:
     """Return the episode results of all records in a folder; errors as in `read_records`."""
-    return [result for record in read_records(folder) for result in record_results(record)]
+    return [result for record in stored.read_records(folder) for result in record_results(record)]
 
 
 def _read(path: Path) -> dict[str, Any]:
     """Read a result; ``ValueError`` if it is damaged or does not yield a valid record, with a
     message that does not name the file."""
-    result = read_json(path)
+    result = stored.read_json(path)
     try:
-        check_record(_gathered([result]))
+        stored.check_record(_gathered([result]))
     except (AttributeError, KeyError, TypeError) as error:
         raise ValueError(f"is not an episode result: {type(error).__name__}: {error}") from None
     return result  # type: ignore[no-any-return]
 
 
 # -- the code and the machine of a run ----------------------------------------------------------
-
-
-def declared_versions() -> dict[str, str]:
-    """Return the version numbers of simulation and scoring, which developers increase when a change
-    of the code changes scores of the same episode."""
-    return {"simulation": str(cache.SIMULATION), "scoring": str(SCORING)}
 
 
 @lru_cache(maxsize=1)
@@ -242,7 +217,7 @@ def provenance() -> dict[str, Any]:
     blas = config["Build Dependencies"]["blas"]
     packages = {name: _version(name) for name in PACKAGES}
     return {
-        "versions": {"python": platform.python_version(), **packages, **declared_versions()},
+        "versions": {"python": platform.python_version(), **packages, **DECLARED_VERSIONS},
         "blas": f"{blas['name']} {blas['version']}",
         "commit": _git("rev-parse", "HEAD"), "dirty": None if status is None else bool(status),
     }
@@ -262,11 +237,10 @@ def _portable(word: str) -> str:
 
 @lru_cache(maxsize=1)
 def machine() -> dict[str, Any]:
-    """Return processor, number of cores, operating system and speed of the machine of this process,
-    in a cluster the machine of the worker.
+    """Return processor, number of cores, operating system and speed of the machine of this process.
 
-    The speed is the time in s of a product of two 1000 × 1000 matrices in double precision on one
-    thread (median of three). Computing times relative to it can be compared between machines.
+    The speed, which makes computing times comparable, is the time in s of a product of two 1000 ×
+    1000 matrices in double precision on one thread (median of three).
     """
     a, b = np.random.default_rng(0).normal(size=(2, 1000, 1000))
     with threadpool_limits(1):
@@ -276,27 +250,24 @@ def machine() -> dict[str, Any]:
 
 
 def _version(package: str) -> str | None:
-    try:
+    with suppress(PackageNotFoundError):
         return version(package)
-    except PackageNotFoundError:
-        return None
+    return None
 
 
 def _git(*arguments: str) -> str | None:
     checkout = PACKAGE.parent
     if not (checkout / ".git").exists():  # installed: an enclosing repository is unrelated
         return None
-    try:
+    with suppress(OSError, subprocess.SubprocessError):
         return subprocess.run(["git", *arguments], cwd=checkout, capture_output=True, text=True,
                               timeout=10, check=True).stdout.strip()
-    except (OSError, subprocess.SubprocessError):
-        return None
+    return None
 
 
 def _processor() -> str:
-    try:
+    with suppress(OSError):
         text = Path("/proc/cpuinfo").read_text(encoding="utf-8")
-    except OSError:
-        text = ""
-    named = re.search(r"^model name[^:\n]*:(.*)", text, re.MULTILINE)
-    return named[1].strip() if named else platform.processor() or platform.machine()
+        if named := re.search(r"^model name[^:\n]*:(.*)", text, re.MULTILINE):
+            return named[1].strip()
+    return platform.processor() or platform.machine()

@@ -12,6 +12,9 @@ from eitbench.bench.run import Job, make_jobs, pending_jobs, run_jobs
 from eitbench.bench.store import EpisodeStore, provenance, record_results
 from eitbench.data.seeds import format_seed, seed_ranges
 
+Version = tuple[str, str, str]
+"""Environment, method and version, as in a record."""
+
 
 def submit(method: str | None, environments: list[str], seeds: list[int] | None,
            store: EpisodeStore, to: Path, *, policy: bool = False, official: bool = False,
@@ -19,11 +22,9 @@ def submit(method: str | None, environments: list[str], seeds: list[int] | None,
            command: str = "") -> Iterator[Path]:
     """Check the arguments, and return an iterator over the paths of records. It runs the episodes
     that neither ``store`` nor an earlier record holds, environment after environment, and writes
-    each record into the folder ``to`` when its environment is finished.
-
-    A record holds all test episodes of this version of the method from the store and from an
-    earlier record, including failed ones. Without ``method`` all built-in methods run, by default
-    in all environments. ``official`` records are made by maintainers from a commit without changes.
+    each record into the folder ``to`` when its environment is finished. A record holds all test
+    episodes of this version of the method from both. Without ``method`` all built-in methods run,
+    by default in all environments.
 
     The call raises ``ValueError`` if a seed is not of the test split, the method is incompatible
     with an environment, an official record is requested from a checkout with changes, or would be
@@ -58,39 +59,40 @@ def _submitted(jobs: list[Job], store: EpisodeStore, to: Path, official: bool, n
     before = [result for record in earlier.values() if record["official"] == official
               for result in record_results(record)]
     run_jobs(pending_jobs(jobs, before), store, n_jobs=n_jobs, backend=backend, command=command)
+    made = {(record["environment"]["name"], record["method"], record["version"]):
+            record | {"official": official} for record in store.records(also=before)
+            if record["split"] == "test"}
     asked = _versions(jobs)
-    made = [record | {"official": official} for record in store.records(also=before)
-            if (record["environment"]["name"], record["method"], record["version"]) in asked
-            and record["split"] == "test"]
-    found = {(record["environment"]["name"], record["method"]) for record in made}
-    for environment, method, _ in asked:
-        if (environment, method) not in found:
+    for version in asked:
+        if version not in made:
+            environment, method, _ = version
             raise ValueError(f"{store.folder} holds no valid result of {method} in {environment}")
-    for record in made:
-        for path, old in earlier.items():
-            missing = [seed for seed in old["seeds"] if seed not in record["seeds"]]
-            if missing and all(old[key] == record[key] for key in ("method", "version")):
-                raise ValueError("to must not hold a record with other episodes; "
-                                 f"{path} would lose its episodes {seed_ranges(missing)}")
-    for record in made:
-        yield write_record(to, record)
+        old = earlier.get(version, made[version])
+        if missing := [seed for seed in old["seeds"] if seed not in made[version]["seeds"]]:
+            raise ValueError("to must not hold a record with other episodes; "
+                             f"{_path(to, version)} would lose its episodes {seed_ranges(missing)}")
+    for version in asked:
+        yield write_record(to, made[version])
 
 
-def _versions(jobs: list[Job]) -> list[tuple[str, str, str]]:
+def _versions(jobs: list[Job]) -> list[Version]:
     """Return environment, method and version of the jobs, without duplicates."""
     return list(dict.fromkeys((job.environment.name, job.load().name, job.load().version)
                               for job in jobs))
 
 
-def _earlier(to: Path, jobs: list[Job], official: bool) -> dict[Path, dict[str, Any]]:
+def _path(to: Path, version: Version) -> Path:
+    """Return the path of the record of test episodes of a version in the folder ``to``."""
+    return to / tracks.record_name(*version, "test")
+
+
+def _earlier(to: Path, jobs: list[Job], official: bool) -> dict[Version, dict[str, Any]]:
     """Read the records in ``to`` of the jobs' versions of methods. ``ValueError`` if one of them is
     official and the new one is not."""
-    found = {}
-    for environment, method, version in _versions(jobs):
-        name = tracks.record_name(environment, method, version, "test")
-        if (path := to / name).exists():
-            found[path] = read_record(path)
-            if found[path]["official"] and not official:
-                raise ValueError("to must not hold an official record; "
-                                 f"{path} would lose its official status")
+    found = {version: read_record(_path(to, version)) for version in _versions(jobs)
+             if _path(to, version).exists()}
+    for version, record in found.items():
+        if record["official"] and not official:
+            raise ValueError(f"to must not hold an official record; {_path(to, version)} would "
+                             "lose its official status")
     return found

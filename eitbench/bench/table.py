@@ -1,5 +1,4 @@
-"""Tables of text cells with sorting keys, for Markdown, terminals and the pages of
-`eitbench.report`."""
+"""Tables of text cells with sorting keys, for Markdown, terminals and HTML pages."""
 
 from __future__ import annotations
 
@@ -71,16 +70,11 @@ class Table(NamedTuple):
                 for column in columns]
 
     def fit_width(self, width: int, order: Sequence[str] = ()) -> Table:
-        """Return the table without the columns for which ``width`` characters are too few.
-
-        Columns that are not in ``order`` are omitted first, then the last in ``order``.
-        """
-        def place(heading: str) -> tuple[int, int]:
-            at = order.index(heading) if heading in order else len(order)
-            return at, self.headings.index(heading)
-
+        """Return the table without the columns for which ``width`` characters are too few: columns
+        that are not in ``order`` are omitted first, then the last in ``order``."""
         table = self
-        for heading in sorted(self.headings, key=place)[:0:-1]:
+        ranked = dict.fromkeys([each for each in order if each in self.headings] + self.headings)
+        for heading in list(ranked)[:0:-1]:
             if len(table.markdown().partition("\n")[0]) <= width:
                 break
             i = table.headings.index(heading)
@@ -98,16 +92,13 @@ class Table(NamedTuple):
         texts = [self.headings, *([cell.plain_text for cell in row.cells] for row in self.rows)]
         lines = [[escape_markdown(text) for text in line] for line in texts]
         widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
-        words = [kind == "words" for kind in self.column_styles]
-
-        def pad(line: list[str]) -> str:
-            cells = (text.ljust(width) if left else text.rjust(width)
-                     for text, width, left in zip(line, widths, words, strict=True))
-            return f"| {' | '.join(cells)} |"
-
-        rule = "|".join("-" * (width + 2) if left else "-" * (width + 1) + ":"
-                        for width, left in zip(widths, words, strict=True))
-        return "\n".join([pad(lines[0]), f"|{rule}|", *map(pad, lines[1:])])
+        sides = ["<" if style == "words" else ">" for style in self.column_styles]
+        rule = "|".join(f"{'-' * width}-{'-' if side == '<' else ':'}"
+                        for width, side in zip(widths, sides, strict=True))
+        padded = [" | ".join(f"{text:{side}{width}}" for text, width, side
+                             in zip(line, widths, sides, strict=True)) for line in lines]
+        first, *others = [f"| {line} |" for line in padded]
+        return "\n".join([first, f"|{rule}|", *others])
 
 
 def number_cell(value: float | None) -> Cell:

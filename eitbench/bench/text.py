@@ -14,8 +14,7 @@ from eitbench.data.seeds import seed_ranges
 
 
 def mean_and_interval(values: list[float]) -> tuple[float, float]:
-    """Return the mean and half its 95 % confidence interval (Student's t), infinite for fewer than
-    two values."""
+    """Return the mean and half its 95 % confidence interval (Student's t), infinite for n < 2."""
     mean = float(np.mean(values))
     n = len(values)
     if n < 2:

@@ -80,8 +80,7 @@ class Environment(NamedTuple):
                 | json.loads(self.kwargs))
 
     def make(self, **extra: Any) -> EstimationEnv | InjectionEnv:
-        """Make the environment without gymnasium's wrappers; ``ValueError`` if the id is unknown or
-        an argument is invalid."""
+        """Make the environment without wrappers; ``ValueError`` if an argument is invalid."""
         arguments = RUN_KWARGS[self.track] | json.loads(self.kwargs) | extra
         _check.choice("estimator", arguments.get("estimator", "full"), ONBOARD_FILTERS)
         made: Any = gym.make(self.id, disable_env_checker=True, **arguments).unwrapped
@@ -153,8 +152,7 @@ def qualified_name(environment: Mapping[str, Any]) -> str:
 
 
 def record_name(environment: str, method: str, version: str, split: str) -> str:
-    """Return the file name of a record: ``ENV--METHOD--VERSION.json``, with the split unless it is
-    test."""
+    """Return a record's file name: ``ENV--METHOD--VERSION.json``, with the split unless test."""
     parts = [environment, method, version, *[split] * (split != "test")]
     return "--".join(parts) + ".json"
 

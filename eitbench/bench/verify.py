@@ -1,5 +1,4 @@
-"""Verify records: rerun some of their episodes, or replay the recorded actions of a policy, and
-compare the scores."""
+"""Verify records: rerun episodes, or replay a policy's recorded actions, and compare the scores."""
 
 from __future__ import annotations
 
@@ -7,6 +6,7 @@ import json
 from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -18,7 +18,7 @@ from eitbench.bench import methods
 from eitbench.bench import records as stored
 from eitbench.bench.isolation import WorkerError
 from eitbench.bench.methods import is_builtin, method_files, method_sha256
-from eitbench.bench.records import read_valid_files, record_file_name, version_number
+from eitbench.bench.records import record_file_name, version_number
 from eitbench.bench.run import Job, isolated_job, run_jobs
 from eitbench.bench.runner import run_method
 from eitbench.bench.scores import compute_scores, scores
@@ -41,12 +41,11 @@ EMPTY_ROW = {"record": "", "environment": "", "method": "", "episode": "", "isol
 
 
 class EpisodeCheck(NamedTuple):
-    """One episode of one record, to be rerun by a job or, without a job, replayed."""
+    """One episode of one record, to be rerun by a `Job` or, without a job, replayed."""
 
     record: dict[str, Any]
     episode: dict[str, Any]
     job: Any
-    """`Job`; None to replay"""
 
 
 def verify(paths: Sequence[Path], folder: Path, *, file: str | None = None, isolate: str = "auto",
@@ -61,10 +60,9 @@ def verify(paths: Sequence[Path], folder: Path, *, file: str | None = None, isol
     Returns
     -------
     DataFrame
-        A row for each episode, or for a record that cannot be read or rerun: record, environment,
-        method, episode, isolation (of the rerun, or ``replay``), score (name of the score with the
-        largest relative difference), difference, recorded and rerun (ẽ_c), problem (a sentence if
-        they cannot be compared or other fields differ), note.
+        A row, with the columns of `EMPTY_ROW`, for each episode, or for a record that cannot be
+        read or rerun. ``score`` has the largest relative ``difference``; ``recorded`` and ``rerun``
+        are ẽ_c; ``problem`` is a sentence if they cannot be compared or other fields differ.
     """
     _check.integer("episodes", episodes, low=1)
     rows: list[dict[str, Any]] = []
@@ -102,10 +100,8 @@ def select_records(folder: Path, environments: Sequence[str] = (), *, top: int =
     or naming all invalid files.
     """
     # without environments no measurements, whose files may be missing
-    read, complaints = read_valid_files(folder, measured=None if environments else False)
-    if complaints:
-        raise ValueError("; ".join(complaints))
-    asked = [record for record in stored.split_outdated(list(read.values()))[0]
+    read = stored.read_records(folder, measured=None if environments else False)
+    asked = [record for record in stored.split_outdated(read)[0]
              if not environments or record["environment"]["id"] in environments]
     chosen = _first(asked, top) if top else [record for record in asked if record["official"]]
     if not chosen:
@@ -221,14 +217,6 @@ def _rerun_row(case: EpisodeCheck, store: EpisodeStore) -> dict[str, Any]:
     return _compared(case, result, problems) | {"note": note}
 
 
-def _replay(k: int, record: dict[str, Any], episode: dict[str, Any]) -> tuple[int, dict[str, Any]]:
-    """Return ``k``, and the result of `replay_actions` or its error message."""
-    try:
-        return k, replay_actions(record, episode)
-    except ValueError as error:
-        return k, {"status": "not replayed", "message": str(error)}
-
-
 def _compared(case: EpisodeCheck, result: dict[str, Any],
               problems: list[str]) -> dict[str, Any]:
     """Return the row of an episode and its new result."""
@@ -246,30 +234,27 @@ def _compared(case: EpisodeCheck, result: dict[str, Any],
             "recorded": recorded, "rerun": rerun, "problem": "; ".join(problems)}
 
 
-def replay_actions(record: dict[str, Any], recorded: dict[str, Any]) -> dict[str, Any]:
-    """Return the result of an episode to which a record's actions are applied without its policy.
-    ``ValueError`` if the record has no actions, or the environment rejects them."""
-    actions = recorded.get("actions")
-    if actions is None:
-        raise ValueError(f"{recorded['seed']} has no recorded actions to replay")
-    replay = methods.Method("injection", record["method"], record["title"], Path(), "",
-                            (record["board"],), {}, lambda *_: _Replay(actions))
-    outcome = run_method(_environment(record), replay, parse_seeds(recorded["seed"])[0]).outcome
-    return {"status": "ok", "scores": compute_scores("injection", outcome),
-            "step_errors": outcome.errors.tolist()}
+def _replay(k: int, record: dict[str, Any],
+            recorded: dict[str, Any]) -> tuple[int, dict[str, Any]]:
+    """Return ``k``, and the result of an episode to which its recorded actions are applied without
+    the policy; the reason if they are missing, or the environment rejects them."""
+    left = iter(recorded.get("actions", ()))
 
-
-class _Replay:
-    """Policy that returns recorded actions."""
-
-    def __init__(self, actions: list[Any]) -> None:
-        self._left = iter(actions)
-
-    def act(self, observation: dict[str, np.ndarray]) -> Any:
-        """Return the next action; ``ValueError`` after the last."""
-        for action in self._left:
+    def act(observation: dict[str, np.ndarray]) -> Any:
+        for action in left:
             return action if isinstance(action, int) else np.asarray(action)
         raise ValueError("actions must have one entry for each step of the episode")
+
+    replay = methods.Method("injection", record["method"], record["title"], Path(), "",
+                            (record["board"],), {}, lambda *_: SimpleNamespace(act=act))
+    try:
+        if "actions" not in recorded:
+            raise ValueError(f"{recorded['seed']} has no recorded actions to replay")
+        outcome = run_method(_environment(record), replay, parse_seeds(recorded["seed"])[0]).outcome
+    except ValueError as error:
+        return k, {"status": "not replayed", "message": str(error)}
+    return k, {"status": "ok", "scores": compute_scores("injection", outcome),
+               "step_errors": outcome.errors.tolist()}
 
 
 def score_differences(recorded: dict[str, Any], result: dict[str, Any]) -> dict[str, float]:
@@ -312,6 +297,7 @@ def describe_problems(rows: pd.DataFrame, tolerance: float) -> list[str]:
 
 
 def _differ(rows: pd.DataFrame, tolerance: float) -> pd.Series:
+    """Return whether each row's rerun differs from the record, or failed."""
     return (rows["difference"] > tolerance) | (rows["problem"] != "")
 
 

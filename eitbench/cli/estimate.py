@@ -21,14 +21,12 @@ def estimate(
         "--baseline", help="Estimator name or path; may be repeated. The first is drawn.")],
     out: Annotated[Path, typer.Option("--out", "-o", help="HTML report.")] = Path("report.html"),
     arrays: Annotated[Path | None, typer.Option(
-        help="Also write all estimates of the first method to this npz file; needs memory for "
-             "all of them.")] = None,
+        help="Also write all estimates of the first method, kept in memory, as npz.")] = None,
     format: Annotated[str | None, typer.Option(
         help="hdf5, ktc, eidors, sciospec or table. Default: detected.")] = None,
     option: Annotated[list[str] | None, typer.Option(
-        "--option", help="Argument NAME=VALUE of the file's reader, such as name=VARIABLE and "
-                         "reference=VARIABLE for an EIDORS file, or frequency=1e4 for Sciospec "
-                         "files; may be repeated.")] = None,
+        "--option", help="Argument NAME=VALUE of the file's reader, such as reference=VARIABLE "
+                         "(EIDORS) or frequency=1e4 (Sciospec); may be repeated.")] = None,
     withheld: Annotated[float, typer.Option(
         min=0.0, max=0.5, help="Fraction of the measurements withheld from the methods; their "
                                "residuals are the score.")] = 0.1,

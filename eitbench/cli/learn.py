@@ -37,20 +37,18 @@ def bank(
     with options.cli_errors():
         numbers = parse_seeds(seeds)
         world = entry(env).world
-    place = folder(world)
-    each = cached_episode_bytes(world)
-    try:
-        place.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise typer.BadParameter(f"episodes cannot be stored in {place}: {error}") from error
-    missing = len(missing_seeds(world, numbers))
-    options.echo(f"{len(numbers)} episodes, {len(numbers) * each / 1e6:.0f} MB in {place}; "
-                f"{missing} to simulate")
-    free = shutil.disk_usage(place).free
-    if missing * each > free:
-        raise typer.BadParameter(f"seeds need {missing * each / 1e9:.1f} GB more, and "
-                                 f"{free / 1e9:.1f} GB are free")
-    with options.cli_errors():
+        place, size = folder(world), cached_episode_bytes(world)
+        try:
+            place.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise ValueError(f"episodes cannot be stored in {place}: {error}") from error
+        missing = len(missing_seeds(world, numbers))
+        options.echo(f"{len(numbers)} episodes, {len(numbers) * size / 1e6:.0f} MB in {place}; "
+                     f"{missing} to simulate")
+        free = shutil.disk_usage(place).free
+        if missing * size > free:
+            raise ValueError(f"seeds need {missing * size / 1e9:.1f} GB more, and "
+                             f"{free / 1e9:.1f} GB are free")
         made = presimulate(world, numbers, n_jobs=jobs, backend=backend)
     options.echo(f"{made} simulated, {len(numbers) - made} were already stored")
 
@@ -107,17 +105,14 @@ def train(
 ) -> None:
     """Train an agent to choose injections.
 
-    The same command resumes from the last checkpoint. The folder receives model.zip, config.json,
-    evaluations.npz (scores on dev episodes), K.monitor.csv (training episodes of the K-th start,
-    with rewards times reward_scale) and logs for TensorBoard.
+    The same command resumes from the last checkpoint. Episodes that `eitbench bank` has not stored
+    are simulated when they begin. The folder receives model.zip, config.json, evaluations.npz
+    (scores on dev episodes), K.monitor.csv (training episodes of the K-th start, with rewards times
+    reward_scale) and logs for TensorBoard.
     """
     from dataclasses import replace
 
     import numpy as np
-
-    from eitbench.data.presimulation import missing_seeds
-    from eitbench.data.seeds import SPLITS
-    from eitbench.worlds.registry import entry
     with options.cli_errors():
         from eitbench.rl import training
         asked = training.read_config(config)
@@ -126,13 +121,6 @@ def train(
         folder = out or Path("results/training") / env.replace("/", "-") / algo / f"seed{seed}"
         options.echo(f"{asked.total_steps} steps of {algo.value}, configured by {config}, with "
                      f"evaluations every {asked.interval} steps, in {folder}")
-        splits = {"dev": asked.evaluation_episodes, "train": asked.episodes}
-        missing = {f"{split}:0-{n - 1}": len(missing_seeds(entry(env).world, SPLITS[split][:n]))
-                   for split, n in splits.items()}
-        if any(missing.values()):
-            options.echo("episodes are simulated when they begin; not stored are "
-                         f"{' and '.join(f'{n} of {seeds}' for seeds, n in missing.items())}; "
-                         "`eitbench bank` simulates them in advance on all cores")
         model = training.train(env, algo.value, asked, seed, folder)
     last = {name: values[-1] for name, values in np.load(folder / "evaluations.npz").items()}
     options.echo(f"wrote {model}: ẽ_c {last['errors'].mean():.3g}, return "
@@ -186,8 +174,8 @@ def fit_model(
     modes: Annotated[int, typer.Option(
         min=1, help="Number of concentration modes; more make filters slower.")] = 64,
     correct: Annotated[bool, typer.Option(
-        "--correct", help="Keep the task's flow model and fit only its residual; needs fewer "
-                          "episodes.")] = False,
+        "--correct", help="Fit only the residual of the task's flow model; needs fewer episodes.",
+    )] = False,
     linearised: Annotated[bool, typer.Option(
         "--linearised", help="Linearise voltages once, about the homogeneous estimate, and fit the "
                              "covariance of the residuals.")] = False,

@@ -60,13 +60,11 @@ Out = Annotated[Path, typer.Option("--out", "-o", help="Folder of the results.")
 Jobs = Annotated[int, typer.Option(
     "--jobs", "-j", min=1, help="Number of processes; each needs a core and 1 to 4 GB of memory.")]
 Backends = Annotated[Backend, typer.Option(
-    "--backend", help="Process backend: loky on this machine; ray or dask (extra cluster) on a "
-                      "cluster.")]
+    "--backend", help="Processes: loky on this machine; ray or dask (extra cluster) on a cluster.")]
 Isolate = Annotated[Isolation, typer.Option(
-    help="Isolation of methods. none: in this process. process: in a separate process. bubblewrap: "
-         "in a separate process without access to files, ground truth or network. auto: none for "
-         "built-in methods; for third-party files bubblewrap in official runs and verification, "
-         "else process.")]
+    help="Isolation of methods. none: in this process; process: in a separate one; bubblewrap: in "
+         "one without access to files, ground truth or network; auto: none for built-in methods, "
+         "bubblewrap for third-party files in official runs and verification, else process.")]
 Environments = Annotated[list[str] | None, typer.Option(
     help=f"Environment {_ENV_HELP} May be repeated.", callback=import_env)]
 EnvironmentId = Annotated[str, typer.Option(
@@ -78,8 +76,6 @@ Records = Annotated[Path, typer.Option(
     help="Folder of the records. If it is missing, the records of the package are used.",
     callback=resolve_path)]
 RECORDS = Path("leaderboards/results")
-METHODS = Path("leaderboards/methods")
-"""Folder of the files of submitted methods."""
 
 
 def parse_episodes(seeds: str | None) -> list[int] | None:

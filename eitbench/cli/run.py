@@ -59,7 +59,7 @@ def run(
 
     Exit status 1 if all episodes of a method failed.
     """
-    from eitbench.bench.run import make_jobs, pending_jobs, run_jobs
+    from eitbench.bench.run import make_jobs, pending_jobs, run_jobs, successful_results
     from eitbench.bench.store import EpisodeStore, folder_results
     from eitbench.bench.variants import variants
     with options.cli_errors():
@@ -72,10 +72,13 @@ def run(
                          isolate=isolate, worlds=worlds)
         before = folder_results(records) if records else []
         store = EpisodeStore(out)
-        left = pending_jobs(todo, before) if before else todo
-        run_jobs(left, store, n_jobs=jobs, backend=backend, command=command_line())
+        run_jobs(pending_jobs(todo, before), store, n_jobs=jobs, backend=backend,
+                 command=command_line())
         print_report(out, todo, worlds, before)
-        _end_if_lost(todo, store, before)
+        done = {job.method for job in successful_results(todo, [*before, *store.results()])}
+        if lost := dict.fromkeys(job.load().name for job in todo if job.method not in done):
+            options.echo(f"all episodes failed for {', '.join(lost)}", err=True)
+            raise typer.Exit(1)
 
 
 def _track_of(env: list[str], baseline: list[str] | None, policy: list[str] | None) -> str:
@@ -144,14 +147,3 @@ def _say_failures(store: EpisodeStore, records: list[dict[str, Any]],
     if found and any(job.isolation != "none" for job in asked):
         options.echo(f"with --seeds {found[0].seeds[0]} --isolate none --jobs 1 the method runs in "
                      "this process, where breakpoint() stops", err=True)
-
-
-def _end_if_lost(asked: Sequence[Job], store: EpisodeStore,
-                 before: Sequence[dict[str, Any]] = ()) -> None:
-    """Exit with status 1 if all episodes of a method failed."""
-    from eitbench.bench.run import successful_results
-    done = {job.method for job in successful_results(asked, [*before, *store.results()])}
-    lost = dict.fromkeys(job.load().name for job in asked if job.method not in done)
-    if lost:
-        options.echo(f"all episodes failed for {', '.join(lost)}", err=True)
-        raise typer.Exit(1)

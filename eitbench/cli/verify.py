@@ -30,8 +30,7 @@ def verify(
         min=0.0, help="Relative tolerance for comparing scores.")] = 1e-6,
     isolate: options.Isolate = options.Isolation.auto,
     held_out: Annotated[int, typer.Option(
-        "--held-out", min=0, help="Number of held-out episodes to compare each record with "
-                                  "(maintainers only).")] = 0,
+        "--held-out", min=0, help="Held-out episodes to compare with (maintainers only).")] = 0,
     secret: Annotated[Path | None, typer.Option(
         help="File of the secret that determines held-out seeds; see docs/trust.md.")] = None,
     every: Annotated[bool, typer.Option(

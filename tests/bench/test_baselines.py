@@ -88,7 +88,7 @@ def test_baselines_may_use_dataclasses(tmp_path):
 def test_only_registered_names_are_built_in(track, tmp_path, monkeypatch):
     """A path without .py is not a method, even if the file with .py exists; a link is resolved to its target; a file
     with a built-in name in another folder is rejected."""
-    ours = builtin_methods(track)[0]
+    ours = next(iter(builtin_methods(track)))
     path = tmp_path / "insider.py"
     path.write_text("raise SystemExit('executed')")
     monkeypatch.chdir(tmp_path)

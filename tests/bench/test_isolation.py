@@ -27,7 +27,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from short import world
-from tiny import FILTER, FIXED_LAG, write_baseline
+from tiny import FILTER, FIXED_LAG, write_baseline, write_policy
 from tiny_worlds import TINY
 
 ROOT = Path(__file__).parents[2]
@@ -36,17 +36,6 @@ INJECTION = Environment(POLICY_ID, json.dumps(world(POLICY_ID) | {"estimator": "
 confined = pytest.mark.skipif(bool(bubblewrap_problem()), reason=bubblewrap_problem() or "bubblewrap works")
 KIND = "process" if bubblewrap_problem() else "bubblewrap"
 
-POLICY = '''"""Random: drawn uniformly."""
-
-
-class Policy:
-    def __init__(self, rules, random):
-        self.rules, self.random = rules, random
-
-    def act(self, observation):
-        {act}
-'''
-
 
 @pytest.fixture(autouse=True)
 def cache(run_cache, monkeypatch):
@@ -54,12 +43,6 @@ def cache(run_cache, monkeypatch):
     monkeypatch.setenv(CACHE_VARIABLE, run_cache)
     yield
     isolation.close()
-
-
-def write_policy(folder, act="return int(self.random.integers(self.rules.action_space.n))"):
-    path = folder / "drawn.py"
-    path.write_text(POLICY.format(act=act))
-    return str(path)
 
 
 def worker(path, kind="bubblewrap", **how):
@@ -301,24 +284,21 @@ def test_failures_end_the_worker(statement, message, tmp_path):
     assert re.search(message, said) and not is_alive
 
 
-@confined
-@pytest.mark.parametrize(("child", "limits", "message"), [
-    ("pass", Limits(threads=100), "ResourceLimitError: it started more than 100|RuntimeError: refused"),
-    ("kept = np.ones(2**25)", Limits(memory=2 << 30), "ResourceLimitError: it held more than 2048 MiB|MemoryError"),
-], ids=["processes", "memory of all processes"])
-def test_limits_hold_for_all_its_processes(child, limits, message, tmp_path):
-    """Processes are also counted by the parent, because the kernel does not count processes of root."""
-    said, _ = ask(write_baseline(tmp_path, update=FORK.format(child=child)), limits=limits)
-    assert re.search(message, said)
+FILL = "[open(f'{Path.home()}/{k}', 'wb').write(bytes(2**20)) for k in range(200)]; raise RuntimeError('wrote all')"
 
 
 @confined
-def test_disk_space_is_limited(tmp_path):
-    """The only writable folder is in memory and has a limited size."""
-    write = ("content = bytes(2**20)\n        for k in range(200):\n"
-             "            open(f'{Path.home()}/{k}', 'wb').write(content)\n        raise RuntimeError('wrote all')")
-    said, _ = ask(write_baseline(tmp_path, update=write), limits=Limits(disk=100 << 20))
-    assert "No space left" in said
+@pytest.mark.parametrize(("update", "limits", "message"), [
+    (FORK.format(child="pass"), Limits(threads=100),
+     "ResourceLimitError: it started more than 100|RuntimeError: refused"),
+    (FORK.format(child="kept = np.ones(2**25)"), Limits(memory=2 << 30),
+     "ResourceLimitError: it held more than 2048 MiB|MemoryError"),
+    (FILL, Limits(disk=100 << 20), "No space left"),
+], ids=["processes", "memory of all processes", "disk"])
+def test_limits_hold_for_all_its_processes(update, limits, message, tmp_path):
+    """Processes are also counted by the parent, because the kernel does not count processes of root. The only writable
+    folder is in memory and has a limited size."""
+    assert re.search(message, ask(write_baseline(tmp_path, update=update), limits=limits)[0])
 
 
 STUBBORN = """
@@ -340,8 +320,8 @@ def test_workers_end_with_their_parent(tmp_path):
     program = ("import json, time, numpy as np; from eitbench.bench import isolation\n"
                f"for kind, path in {paths!r}.items():\n"
                f"    there = isolation.Worker('estimation', {FILTER.id!r}, {json.loads(FILTER.kwargs)!r}, path, kind)\n"
-               "    there(None); isolation._started.clear(); there._stream.write(isolation.encode_message("
-               "{'do': 'update', 'voltages': np.zeros(4), 'currents': np.zeros(4)})); there._stream.flush()\n"
+               "    there(None); isolation._started.clear(); there._process.stdin.write(isolation.encode_message("
+               "{'do': 'update', 'voltages': np.zeros(4), 'currents': np.zeros(4)})); there._process.stdin.flush()\n"
                "    time.sleep(1.0); print(*there._family(), end=' ')\n"
                "print(flush=True); time.sleep(60)")
     with subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE, text=True) as host:

@@ -135,28 +135,21 @@ def test_lagged_modes_are_of_the_same_state(study, short, monkeypatch):
     np.testing.assert_array_equal(seen["inputs"], np.concatenate([found["inputs"][2:], seen["reduced"]], axis=1))
 
 
-@pytest.mark.parametrize("changes, assumed, accepted", [
-    ({"schedule": {"scored_steps": 5}, "instrument": {"noise_relative": 0.02}}, {}, True),
-    ({}, {"mean_velocity": 4.0}, False),
-    (FAST, {}, False),
-])
-def test_networks_are_compatible_with_their_training_task(changes, assumed, accepted):
-    """Episodes of other lengths are accepted; other vessels and flow models are rejected."""
-    task = make_task(entry(ID).world.with_changes(changes), **assumed)
-    assert load_method("learned_correction", "estimation").suits(task) == accepted
-
-
-@pytest.mark.parametrize("id, method", [
-    ("eitbench/Pipe2DSmoothing-v0", "learned_smoother"), ("eitbench/Pipe2DFixedLag-v0", "learned_fixed_lag"),
-    ("eitbench/Pipe2DObstacle-v0", "learned_obstacle"), ("eitbench/Pipe2D-v0", "learned_voltages")])
-def test_networks_are_for_their_lag_and_vessel(id, method):
-    """Networks match a lag and a vessel; the obstacle needs another network, tanks and known flows have none."""
-    task = make_task(entry(id).world, **entry(id).settings)
-    assert load_method(method, "estimation").suits(task)
-    assert not load_method(method, "estimation").suits(make_task(entry("eitbench/StationaryTank2D-v0").world))
-    assert load_method("learned_obstacle", "estimation").suits(task) == (method == "learned_obstacle")
-    other = make_task(entry(id).world, lag=3)
-    assert not load_method("learned_fixed_lag", "estimation").suits(other)
+@pytest.mark.parametrize(("id", "changes", "arguments", "suitable", "unsuitable"), [
+    # episodes of other lengths are accepted; other vessels, lags and flow models are rejected
+    (ID, {"schedule": {"scored_steps": 5}, "instrument": {"noise_relative": 0.02}}, {}, {"learned_correction"}, set()),
+    (ID, {}, {"mean_velocity": 4.0}, set(), {"learned_correction"}), (ID, FAST, {}, set(), {"learned_correction"}),
+    ("eitbench/Pipe2DSmoothing-v0", {}, {}, {"learned_smoother"}, {"learned_obstacle"}),
+    ("eitbench/Pipe2DFixedLag-v0", {}, {}, {"learned_fixed_lag"}, {"learned_obstacle"}),
+    ("eitbench/Pipe2DFixedLag-v0", {}, {"lag": 3}, set(), {"learned_fixed_lag"}),
+    ("eitbench/Pipe2DObstacle-v0", {}, {}, {"learned_obstacle"}, set()),
+    ("eitbench/Pipe2D-v0", {}, {}, {"learned_voltages"}, {"learned_obstacle"}),
+    ("eitbench/StationaryTank2D-v0", {}, {}, set(), set(LEARNED))])
+def test_networks_are_compatible_with_their_training_task(id, changes, arguments, suitable, unsuitable):
+    """Networks match a lag, a vessel and a flow model."""
+    task = make_task(entry(id).world.with_changes(changes), **dict(entry(id).settings) | arguments)
+    found = {name for name in suitable | unsuitable if load_method(name, "estimation").suits(task)}
+    assert found == suitable
 
 
 @pytest.mark.parametrize("name", LEARNED)

@@ -27,6 +27,7 @@ from scipy.stats import t as student
 
 from injection_envs import BUDGET, CURRENTS, FAULTS, FLOW, INFLOW, NAME, TANK, filter_of, injected
 from short import merged, world
+from tiny import write_policy
 
 SHORT = world(NAME)
 KWARGS = {name: world(name) for name in (NAME, INFLOW, CURRENTS, FAULTS, FLOW, TANK)} | {
@@ -36,28 +37,6 @@ SEED = 5
 
 def environment(name: str) -> InjectionEnv:
     return runner.cached_environment(Environment(name, json.dumps(KWARGS[name] | {"estimator": "reduced"})))
-
-
-def actions_of(name: str, policy: str, monkeypatch) -> list[np.ndarray]:
-    """Return all currents that were injected in an episode."""
-    env, taken, step = environment(name), [], InjectionEnv.step
-    with monkeypatch.context() as patch:
-        patch.setattr(InjectionEnv, "step", lambda self, action: taken.append(np.array(action)) or step(self, action))
-        played = injected(name, KWARGS[name], policy, SEED, "reduced")
-    assert len(taken) == env.core.length
-    budget = env.rules.budget
-    assert played.n_injections <= (len(taken) if budget is None else budget)
-    assert len(played.errors) == env.world.schedule.scored_steps
-    assert 0.0 < played.errors.mean() < 1.0 and played.seconds_per_step >= 0.0
-    return taken
-
-
-def write_policy(folder, body: str = "def act(self, observation): return 7", name: str = "mine") -> str:
-    """Return the path of a policy file whose class has this body."""
-    path = folder / f"{name}.py"
-    path.write_text('"""Mine: always the same."""\nclass Policy:\n'
-                    f"    def __init__(self, rules, random): pass\n    {body}\n")
-    return str(path)
 
 
 # -- belief -----------------------------------------------------------------------------------------------------------
@@ -178,22 +157,14 @@ def test_policies_run_in_compatible_environments(policy, name, monkeypatch):
         with pytest.raises(ValueError, match=f"policy {policy} does not suit {name}"):
             injected(name, KWARGS[name], policy, SEED, "reduced")
         return
-    taken = actions_of(name, policy, monkeypatch)
+    taken, step = [], InjectionEnv.step
+    monkeypatch.setattr(InjectionEnv, "step", lambda self, action: taken.append(np.array(action)) or step(self, action))
+    played = injected(name, KWARGS[name], policy, SEED, "reduced")
     dtype = np.float32 if env.rules.limit else np.int64
-    assert all(env.action_space.contains(action.astype(dtype)) for action in taken)
-
-
-def test_scores_are_computed_with_the_exact_filter():
-    """The mean error with the full estimator equals the mean error of its estimates, step by step."""
-    played = injected(NAME, SHORT, "best_pair", SEED)
-    env = runner.cached_environment(Environment(NAME, json.dumps(SHORT | {"estimator": "full"})))
-    env.reset(seed=SEED)
-    errors = []
-    for _ in range(env.core.length):
-        env.step(7)
-        assert (env.error is None) == (env.core.t <= env.world.warm_up)
-        errors += [env.core.errors()[0]] * (env.error is not None)
-    assert played.errors.tolist() == errors
+    assert all(env.action_space.contains(action.astype(dtype)) for action in taken) and len(taken) == env.core.length
+    assert played.n_injections <= (len(taken) if env.rules.budget is None else env.rules.budget)
+    assert len(played.errors) == env.world.schedule.scored_steps
+    assert 0.0 < played.errors.mean() < 1.0 and played.seconds_per_step >= 0.0
 
 
 def jobs_of(policies: list[str], seeds: str, **kwargs) -> list[Job]:
@@ -201,32 +172,24 @@ def jobs_of(policies: list[str], seeds: str, **kwargs) -> list[Job]:
             for policy in policies for seed in parse_seeds(seeds)]
 
 
-def test_finished_episodes_are_stored(tmp_path):
-    """The record has the same format as for estimators."""
+def test_finished_and_failed_episodes_are_stored(tmp_path):
+    """The record has the same format as for estimators; a failed episode has the reason, and no row."""
     store = EpisodeStore(tmp_path / "new")
-    todo = jobs_of(["opposite", "adjacent"], "dev:1,0", estimator="reduced")
+    bad = write_policy(tmp_path, "return 0.5", "bad")
+    todo = jobs_of(["random_pair", "adjacent", bad], "dev:1,0", estimator="reduced")
     run_jobs(todo, store, command="eitbench run")
     rows = policy_rows(todo, store.results())
     assert sorted(zip(rows["policy"], rows["seed"], strict=True)) == [
-        (policy, seed) for policy in ("adjacent", "opposite") for seed in ("dev:0", "dev:1")]
+        (policy, seed) for policy in ("adjacent", "random_pair") for seed in ("dev:0", "dev:1")]
     played = injected(NAME, SHORT, "adjacent", parse_seeds("dev:0")[0], "reduced")
     assert rows.set_index(["policy", "seed"])["error"]["adjacent", "dev:0"] == played.errors.mean()
-    record, _ = store.write_records()
+    record, failed, floor = store.write_records()
     assert (record["board"], record["method"], record["seeds"]) == ("injection", "adjacent", ["dev:0", "dev:1"])
     assert record["environment"]["kwargs"]["estimator"] == "reduced"
     assert record["episodes"][0]["scores"]["spent"] == played.n_injections > 0
     assert record["episodes"][0]["step_errors"] == played.errors.tolist()
-
-
-def test_a_mistake_is_the_result_of_its_policy(tmp_path):
-    """Failed episodes are recorded with the reason, without a row; privileged methods are marked."""
-    store = EpisodeStore(tmp_path)
-    bad = write_policy(tmp_path, "def act(self, observation): return 0.5", "bad")
-    run_jobs(jobs_of([bad, "random_pair"], "dev:0", estimator="reduced"), store)
-    failed, floor = store.write_records()
     assert "action must be an integer" in failed["episodes"][0]["message"] and failed["role"] is None
     assert floor["episodes"][0]["status"] == "ok" and floor["role"] == "floor"
-    assert policy_rows(jobs_of([bad], "dev:0", estimator="reduced"), store.results()).empty
 
 
 def test_errors_of_policies_are_ordered_and_pool_trainings():
@@ -248,23 +211,15 @@ def test_errors_of_policies_are_ordered_and_pool_trainings():
 
 def test_unknown_names_are_reported(tmp_path):
     """Unknown policies, environments and estimators are reported, and a file without a policy."""
-    with pytest.raises(ValueError, match=r"mine\.py: Policy must have a method act\(observation\)"):
-        load_method(write_policy(tmp_path, "x = 1"), "injection")
+    (tmp_path / "mine.py").write_text("class Policy: pass")
     (tmp_path / "greedy_a.zip").write_bytes(b"PK")
-    with pytest.raises(ValueError, match=r"greedy_a\.zip has the name of a built-in method"):
-        load_method(str(tmp_path / "greedy_a.zip"), "injection")
-    with pytest.raises(ValueError, match="environment eitbench/Pipe2D-v0 is not of the track injection"):
-        injected("eitbench/Pipe2D-v0", {}, "adjacent", 1)
-    with pytest.raises(ValueError, match="estimator must be one of full, reduced; got 'none'"):
-        injected(NAME, SHORT, "adjacent", 1, "none")
-
-
-def test_a_third_party_file_runs(tmp_path):
-    """Its title is the start of its docstring."""
-    loaded = load_method(path := write_policy(tmp_path), "injection")
-    assert (loaded.name, loaded.title, loaded.privileged, loaded.parameters) == ("mine", "Mine", False, {})
-    played = injected(NAME, SHORT, path, SEED, "reduced")
-    assert played.errors.tolist() == injected(NAME, SHORT, "best_pair", SEED, "reduced").errors.tolist()
+    for name, kwargs, policy, estimator, message in (
+            (NAME, SHORT, str(tmp_path / "mine.py"), "full", r"mine\.py: Policy must have a method act\(observ"),
+            (NAME, SHORT, str(tmp_path / "greedy_a.zip"), "full", r"greedy_a\.zip has the name of a built-in method"),
+            ("eitbench/Pipe2D-v0", {}, "adjacent", "full", "environment eitbench/Pipe2D-v0 is not of the track inj"),
+            (NAME, SHORT, "adjacent", "none", "estimator must be one of full, reduced; got 'none'")):
+        with pytest.raises(ValueError, match=message):
+            injected(name, kwargs, policy, 1, estimator)
 
 
 # -- adaptivity gap ---------------------------------------------------------------------------------------------------
@@ -277,14 +232,15 @@ def hand_made(**errors: list[float]) -> pd.DataFrame:
 
 
 def test_adaptivity_gap_is_the_formula():
-    """The gap is (2 − 1)/(5 − 1) for a given table; the open-loop policy with the smaller mean is used."""
+    """The gap is (2 − 1)/(5 − 1) for a given table; the open-loop policy with the smaller mean is used. Two episodes
+    are too few for an interval."""
     table = hand_made(clairvoyant=[1.0, 1.0], random_pair=[4.0, 6.0], a=[1.5, 2.5], b=[1.0, 9.0], spy=[0.0, 0.0])
-    gap, low, high = adaptivity_gap(table, ["b", "a"])
-    assert gap == 0.25
-    assert (low, high) == (-np.inf, np.inf)         # two episodes are too few for an interval
-    assert adaptivity_gap(table, ["a", "b"]) == (gap, low, high)
+    assert adaptivity_gap(table, ["b", "a"]) == adaptivity_gap(table, ["a", "b"]) == (0.25, -np.inf, np.inf)
     same = hand_made(clairvoyant=[1.0] * 9, random_pair=[5.0] * 9, a=[2.0] * 9)
     assert adaptivity_gap(same, ["a"]) == (0.25, 0.25, 0.25)
+    for incomplete in ([], ["c"]):
+        with pytest.raises(ValueError, match="rows must hold clairvoyant, random_pair and some open-loop policies"):
+            adaptivity_gap(pd.concat([table, hand_made(c=[2.0])]), incomplete)
 
 
 def test_attained_fraction_compares_with_the_oracle():
@@ -323,11 +279,3 @@ def test_the_interval_of_the_adaptivity_gap_is_student_s():
     slopes = ((best - seer) - gap * (lot - seer)) / span
     half = student.ppf(0.975, 11) * slopes.std(ddof=1) / np.sqrt(12)
     assert (high - low) / 2 == pytest.approx(half, rel=0.04)
-
-
-@pytest.mark.parametrize("open_loop", [[], ["c"]])
-def test_an_incomplete_table_is_rejected(open_loop):
-    """Every policy of the gap must have finished every episode."""
-    table = hand_made(clairvoyant=[1.0, 1.0], random_pair=[4.0, 6.0], c=[2.0])
-    with pytest.raises(ValueError, match="rows must hold clairvoyant, random_pair and some open-loop policies"):
-        adaptivity_gap(table, open_loop)

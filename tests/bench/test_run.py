@@ -2,8 +2,6 @@
 
 import json
 import re
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -68,9 +66,9 @@ MISTAKES = {
     "return Estimate('thirty')": "must be an array of numbers",
     "return Estimate(1e9 * self.level)": "must lie within ±250",
     "return None": "t = 1 it returned None",
-    "return Estimate(self.level, -self.level)": "variance must be finite, ≥ 0",
+    "return Estimate(self.level, -self.level)": "variance must be at least 0 .*, got -29",
     "return Estimate(self.level, np.inf * self.level)": "variance must be finite",
-    "return Estimate(self.level, self.level[:5])": r"variance .* shape \(1701,\), got shape \(5,\)",
+    "return Estimate(self.level, self.level[:5])": r"variance must have shape \(1701,\), got \(5,\)",
     "return self.level": "must return an Estimate",
     "return Estimate(self.level, None, voltages, np.full((4, 4), np.nan))": "innovation",
     "return Estimate(self.level, None, voltages[:2], np.eye(4))": "innovation",
@@ -99,20 +97,16 @@ def test_only_scored_states_need_a_variance(tmp_path):
     warm_up = PIPE_2D.with_changes(FAST).warm_up
     assert warm_up == 2 and np.isnan(fields["std"][:warm_up]).all() and (fields["std"][warm_up:] == 2).all()
     calibration = ("crps", "coverage_50", "coverage_90", "spread_ratio")
-    assert all(claimed[name] is not None for name in calibration)
-    assert all(unclaimed[name] is None for name in calibration)
+    assert all(claimed[name] is not None and unclaimed[name] is None for name in calibration)
     assert claimed["nis"] is None and unclaimed["error"] == claimed["error"]
 
 
 def test_nis_requires_all_innovations(tmp_path):
     """NIS requires the innovations of all scored measurements, not of a selection that fits."""
-    fits = "Estimate(self.level, None, np.ones(4), np.eye(4))"
-    often, once = (run_episode(Job(FILTER, write_baseline(tmp_path, name, update=update), 1))[0]
-                   for name, update in (("often", f"return {fits}"),
-                                        ("once", f"return {fits} if self.calls == 4 else "
-                                                 "Estimate(self.level)")))
-    assert often["scores"]["nis"] == 1.0 and once["scores"]["nis"] is None
-    assert often["scores"]["error"] == once["scores"]["error"]
+    update = "return Estimate(self.level, None, np.ones(4), np.eye(4)) if self.calls in {} else Estimate(self.level)"
+    often, once = (run_episode(Job(FILTER, write_baseline(tmp_path, update=update.format(calls)), 1))[0]["scores"]
+                   for calls in ("range(9)", "[4]"))
+    assert often["nis"] == 1.0 and once["nis"] is None and often["error"] == once["error"]
 
 
 # -- inputs of estimators ---------------------------------------------------------------------------------------------
@@ -284,31 +278,17 @@ def test_second_run_does_nothing(store, tmp_path):
     assert count(log) == 5 and all("changed" in result["message"] for result in store.results())
 
 
-@pytest.mark.parametrize("how", ["KeyboardInterrupt", "SIGKILL"])
-def test_interrupted_run_resumes(how, store, tmp_path):
-    """After Ctrl-C, or a kill, in the third of four episodes: two are stored, and two remain."""
+def test_interrupted_run_resumes(store, tmp_path):
+    """After Ctrl-C in the third of four episodes: two are stored, and two remain."""
     log, armed = tmp_path / "log", tmp_path / "armed"
     armed.touch()
-    stop = "raise KeyboardInterrupt" if how == "KeyboardInterrupt" else "os.kill(os.getpid(), 9)"
-    update = f"if Path({str(armed)!r}).exists() and len(open({str(log)!r}).readlines()) == 3: {stop}"
+    update = f"if Path({str(armed)!r}).exists() and len(open({str(log)!r}).readlines()) == 3: raise KeyboardInterrupt"
     path = write_baseline(tmp_path, init=counting(log), update=f"{update}\n        return Estimate(self.level)")
     jobs = [Job(FILTER, path, seed) for seed in (1, 2, 3, 4)]
-    if how == "KeyboardInterrupt":
-        with pytest.raises(KeyboardInterrupt):
-            run_jobs(jobs, store)
-    else:
-        assert in_another_process(jobs, store).wait() == -9
+    with pytest.raises(KeyboardInterrupt):
+        run_jobs(jobs, store)
     assert sum(result["status"] == "ok" for result in store.results()) == 2
     armed.unlink()
     run_jobs(jobs, store)
     assert count(log) == 3 + 2 and len(list(store.results())) == 4
     assert not [file for file in store.folder.rglob("*") if file.name.startswith(".")]
-
-
-def in_another_process(jobs, store):
-    """Return a started process that runs these jobs."""
-    plain = [[list(job.environment), job.method, job.seed] for job in jobs]
-    program = ("from pathlib import Path; from eitbench.bench.run import *\n"
-               f"jobs = [Job(Environment(*environment), *rest) for environment, *rest in {plain!r}]\n"
-               f"run_jobs(jobs, EpisodeStore(Path({str(store.folder)!r})))")
-    return subprocess.Popen([sys.executable, "-c", program])

@@ -54,12 +54,6 @@ def test_interquartile_mean_is_scipys(n):
     assert interquartile_mean(*scores) == pytest.approx(stats.trim_mean(scores, 0.25, axis=None), rel=1e-12)
 
 
-def test_interquartile_mean_pools_and_the_mean_does_not():
-    """Pooled 0, 0, 0, 0, 0, 0, 4, 8: the middle four are 0. The mean of the means 0 and 6 is 3."""
-    assert interquartile_mean([0.0] * 6, [4.0, 8.0]) == 0.0
-    assert mean_over_environments([0.0] * 6, [4.0, 8.0]) == 3.0
-
-
 # -- bootstrap --------------------------------------------------------------------------------------------------------
 
 
@@ -285,10 +279,3 @@ def test_errors_name_the_argument(call, message):
     """The message explains the reason."""
     with pytest.raises(ValueError, match=message):
         call()
-
-
-@pytest.mark.parametrize("statistic", [interquartile_mean, mean_over_environments])
-def test_constant_environments_have_no_interval(statistic):
-    """Two environments that always score 0.25 and 0.75 have an interval of length zero."""
-    scores = {"pipe": [0.25] * 8, "tank": [0.75] * 8}
-    assert stratified_bootstrap(scores, statistic) == (0.5, 0.5, 0.5)

@@ -21,7 +21,7 @@ from eitbench.data.seeds import SPLITS, parse_seeds
 
 from commands import eitbench
 from short import shorten
-from tiny import FILTER, SMOOTHING, git_says, write_baseline
+from tiny import FILTER, SMOOTHING, git_says, write_baseline, write_policy
 from tiny_worlds import TINY
 
 INJECTION = "eitbench/Pipe2DInjection-v0"
@@ -261,24 +261,11 @@ def test_the_first_records_of_a_board_are_chosen(own):
 # -- recorded actions ---------------------------------------------------------------------------
 
 
-DRAWN = '''"""Drawn currents."""
-
-
-class Policy:
-    def __init__(self, rules, random):
-        self.space, self.random = rules.action_space, random
-
-    def act(self, observation):
-        drawn = self.random.uniform(-1.0, 1.0, self.space.shape).astype(self.space.dtype)
-        return drawn - drawn.mean()
-'''
-
-
 @pytest.mark.parametrize("env", [INJECTION, CURRENTS])
 def test_recorded_actions_are_replayed_without_the_policy(env, monkeypatch):
     """For pairs and currents, other actions give other scores, and a missing action is reported."""
-    Path("drawn.py").write_text(DRAWN)
-    policy = "random_pair" if env == INJECTION else "drawn.py"
+    currents = "x = self.random.uniform(-1.0, 1.0, self.space.shape).astype('f4'); return x - x.mean()"
+    policy = "random_pair" if env == INJECTION else write_policy(Path(), currents)
     assert eitbench("run", "--env", env, "--policy", policy, "--isolate", "none", *REDUCED)[0] == 0
     (path,) = Path("results/records").iterdir()
     record = read_record(path)

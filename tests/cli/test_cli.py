@@ -72,17 +72,13 @@ def test_a_users_file_has_a_table_and_a_page(tmp_path):
     assert (results / "leaderboard.md").read_text(encoding="utf-8") == table and (results / "index.html").exists()
 
 
-def test_every_subtrack_by_default(tmp_path):
-    """Without environments an estimator has a job in every environment of the quick suite of its subtracks."""
-    (tmp_path / "mine.py").write_text(MINE.replace("class Estimator:", "class Estimator:\n"
-                                                   "    subtracks = ('filter', 'smoothing')"))
+def test_suites(tmp_path):
+    """full has every environment; quick the plain pipe with fewer seeds, without methods that take minutes. Methods
+    fitted to a real pipe are incompatible with tiny worlds. A user's file has a job for each of its subtracks."""
+    subtracks = "class Estimator:\n    subtracks = ('filter', 'smoothing')"
+    (tmp_path / "mine.py").write_text(MINE.replace("class Estimator:", subtracks))
     jobs = run.make_jobs("estimation", [], ["mine.py"], [1], suite="quick")
     assert [job.environment.id for job in jobs] == [PIPE, "eitbench/Pipe2DSmoothing-v0"]
-
-
-def test_suites():
-    """full has every environment; quick the plain pipe with fewer seeds, without methods that take minutes. Methods
-    fitted to a real pipe are incompatible with tiny worlds."""
     quick, full = (run.make_jobs("estimation", [], [], [1], suite=suite) for suite in ("quick", "full"))
     plain = set(PLAIN) & set(ids("estimation"))
     assert {job.environment.id for job in quick} == plain and len(plain) == 3
@@ -188,7 +184,6 @@ def test_documented_commands_are_commands():
     (["run", "--policy", "random_pair"], "env must be given with policy"),
     (["run", "--env", INJECTION, "--baseline", "kalman_filter"], "one run must be of estimators or of injection"),
     (["run", "--env", INJECTION, "--records", "nowhere"], "--records must be a folder, got nowhere"),
-    (["policies", "--env", "x"], "use `eitbench run --env ID --policy NAME`"),
     (["rnu"], "No such command"),
 ])
 def test_mistakes_are_explained(arguments, message, tmp_path):
