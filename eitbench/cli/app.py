@@ -232,3 +232,24 @@ def render(
         animate(env, [policy] if policy else baseline or ["kalman_filter"], seed, step, out,
                 every=every, isolate=isolate)
         options.echo(f"wrote {out}")
+
+
+REPLACED = {
+    "cards": "eitbench golden", "check": "eitbench verify RECORDS…",
+    "fit-model": "eitbench fit model", "fit-prior": "eitbench fit prior",
+    "policies": "eitbench run --env ID --policy NAME", "reproduce": "python studies/thesis NAME",
+    "season": "eitbench verify --top 3 --held-out 20 --secret FILE",
+    "submit-measured": "eitbench submit --env eitbench/Measured-CASE-v0"}
+"""Removed command -> replacement."""
+
+
+def report_removed(context: typer.Context) -> None:
+    """Print the replacement of a removed command."""
+    name = str(context.info_name)
+    options.echo(f"`eitbench {name}` was removed: use `{REPLACED[name]}`", err=True)
+    raise typer.Exit(2)
+
+
+for _name in REPLACED:
+    app.command(_name, hidden=True, add_help_option=False, context_settings={
+        "allow_extra_args": True, "ignore_unknown_options": True})(report_removed)

@@ -2,6 +2,8 @@
 
 import json
 import re
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -278,17 +280,31 @@ def test_second_run_does_nothing(store, tmp_path):
     assert count(log) == 5 and all("changed" in result["message"] for result in store.results())
 
 
-def test_interrupted_run_resumes(store, tmp_path):
-    """After Ctrl-C in the third of four episodes: two are stored, and two remain."""
+@pytest.mark.parametrize("how", ["KeyboardInterrupt", "SIGKILL"])
+def test_interrupted_run_resumes(how, store, tmp_path):
+    """After Ctrl-C, or a kill, in the third of four episodes: two are stored, and two remain."""
     log, armed = tmp_path / "log", tmp_path / "armed"
     armed.touch()
-    update = f"if Path({str(armed)!r}).exists() and len(open({str(log)!r}).readlines()) == 3: raise KeyboardInterrupt"
+    stop = "raise KeyboardInterrupt" if how == "KeyboardInterrupt" else "os.kill(os.getpid(), 9)"
+    update = f"if Path({str(armed)!r}).exists() and len(open({str(log)!r}).readlines()) == 3: {stop}"
     path = write_baseline(tmp_path, init=counting(log), update=f"{update}\n        return Estimate(self.level)")
     jobs = [Job(FILTER, path, seed) for seed in (1, 2, 3, 4)]
-    with pytest.raises(KeyboardInterrupt):
-        run_jobs(jobs, store)
+    if how == "KeyboardInterrupt":
+        with pytest.raises(KeyboardInterrupt):
+            run_jobs(jobs, store)
+    else:
+        assert in_another_process(jobs, store).wait() == -9
     assert sum(result["status"] == "ok" for result in store.results()) == 2
     armed.unlink()
     run_jobs(jobs, store)
     assert count(log) == 3 + 2 and len(list(store.results())) == 4
     assert not [file for file in store.folder.rglob("*") if file.name.startswith(".")]
+
+
+def in_another_process(jobs, store):
+    """Return a started process that runs these jobs."""
+    plain = [[list(job.environment), job.method, job.seed] for job in jobs]
+    program = ("from pathlib import Path; from eitbench.bench.run import *\n"
+               f"jobs = [Job(Environment(*environment), *rest) for environment, *rest in {plain!r}]\n"
+               f"run_jobs(jobs, EpisodeStore(Path({str(store.folder)!r})))")
+    return subprocess.Popen([sys.executable, "-c", program])

@@ -184,6 +184,7 @@ def test_documented_commands_are_commands():
     (["run", "--policy", "random_pair"], "env must be given with policy"),
     (["run", "--env", INJECTION, "--baseline", "kalman_filter"], "one run must be of estimators or of injection"),
     (["run", "--env", INJECTION, "--records", "nowhere"], "--records must be a folder, got nowhere"),
+    (["policies", "--env", "x"], "use `eitbench run --env ID --policy NAME`"),
     (["rnu"], "No such command"),
 ])
 def test_mistakes_are_explained(arguments, message, tmp_path):
