@@ -44,9 +44,9 @@ from eitbench.worlds.registry import entries
 ALL = "all"
 """Name of the environment in the rows of an aggregate."""
 IDENTITY_FIELDS = ("class", "environment", "method", "version", "title", "rank", "note", "official",
-            "seeds")
-INTERVAL_SCORES = ("error", "gain")
-"""Numbers with an interval."""
+                   "seeds")
+INTERVAL_HEADINGS = {"error": "ẽ_c", "gain": "skill score"}
+"""Score with an interval -> heading."""
 SKILL_ANCHORS = ("homogeneous", "true_model_smoother")
 """Methods with normalised scores 0 and 1."""
 Anchors = Mapping[tuple[str, str, str], Mapping[str, float]]
@@ -83,7 +83,7 @@ class MethodRow(NamedTuple):
     """One method on a board."""
 
     cells: dict[str, Any]
-    """Values of `csv_fields`; None if missing."""
+    """Column of `leaderboard_table` -> value; None if missing."""
     record: dict[str, Any] | None = None
     """Restricted to the board's episodes; None in an aggregate."""
     skill_scores: dict[str, float] = {}  # noqa: RUF012 (never changed)
@@ -135,10 +135,10 @@ class MethodRow(NamedTuple):
         return not self.complete, value, self.label
 
     def interval(self, name: str) -> tuple[float, float, float]:
-        """Return a score and the ends of its interval; NaN and infinite where unknown."""
-        value, low, high = (self.cells[f"{name}{end}"] for end in ("", "_low", "_high"))
-        return (math.nan if value is None else value, -math.inf if low is None else low,
-                math.inf if high is None else high)
+        """Return a score and the ends of its interval; NaN where unknown."""
+        ends = [self.cells[f"{name}{end}"] for end in ("", "_low", "_high")]
+        value, low, high = np.array(ends, dtype=float).tolist()
+        return value, low, high
 
 
 class Leaderboard(NamedTuple):
@@ -189,28 +189,25 @@ def columns(*, measured: bool = True) -> dict[str, tuple[str, str]]:
     return first | each | COST_COLUMNS
 
 
-def headings(*, measured: bool = False) -> dict[str, str]:
+def headings() -> dict[str, str]:
     """Return column -> heading of all numbers without an interval."""
-    return {name: heading for name, (heading, _) in columns(measured=measured).items()
-            if name not in INTERVAL_SCORES}
+    return {name: heading for name, (heading, _) in columns().items()
+            if name not in INTERVAL_HEADINGS}
 
 
-def column_descriptions(*, measured: bool = False) -> dict[str, str]:
+def column_descriptions(*, measured: bool = True) -> dict[str, str]:
     """Return heading -> explanation."""
     return {"rank": _RANK, **dict(columns(measured=measured).values())}
 
 
-def csv_fields() -> list[str]:
-    """Return the columns of leaderboard.csv."""
-    ends = [f"{name}{end}" for name in INTERVAL_SCORES for end in ("", "_low", "_high")]
-    return [*IDENTITY_FIELDS, *ends, *headings()]
-
-
 def leaderboard_table(found: Iterable[Leaderboard]) -> pd.DataFrame:
-    """Return one row for each row of the boards, with the columns of `csv_fields`."""
-    rows = [row.cells for board in found for row in board.rows]
-    types: dict[str, Any] = dict.fromkeys(csv_fields()[len(IDENTITY_FIELDS):], float)
-    return pd.DataFrame(rows, columns=csv_fields()).astype(types | {"rank": "Int64"})
+    """Return one row for each row of the boards, with the columns of leaderboard.csv."""
+    numbers = [f"{name}{end}" for name in INTERVAL_HEADINGS for end in ("", "_low", "_high")]
+    numbers += [name for name in columns(measured=False) if name not in INTERVAL_HEADINGS]
+    rows = pd.DataFrame([row.cells for board in found for row in board.rows],
+                        columns=[*IDENTITY_FIELDS, *numbers])
+    types: dict[str, Any] = dict.fromkeys(numbers, float)
+    return rows.astype(types | {"rank": "Int64"})
 
 
 # -- environments ----------------------------------------------------------------------------------
@@ -307,10 +304,10 @@ def _board(records: list[dict[str, Any]], known: Anchors, products: dict[str, fl
     floor = naive_baseline_record(records)
     shown = [floor] if floor and ranked else records
     seeds = {seed for record in shown for seed in record["seeds"]}
-    zero = episode_errors(floor)
+    zero = episode_scores(floor)
     rows = sorted((_row(record, seeds, zero, known, products) for record in records
                    if not seeds.isdisjoint(record["seeds"])), key=MethodRow.place)
-    scores = {row.label: {environment: episode_errors(row.record)} for row in rows
+    scores = {row.label: {environment: episode_scores(row.record)} for row in rows
               if ranked and not row.cells["note"]}
     return Leaderboard(record_category(records[0]), environment, environment_title(records[0]),
                        _with_ranks(rows, scores))
@@ -338,7 +335,7 @@ def _row(whole: dict[str, Any], seeds: set[str], zero: dict[str, float], known: 
     record = whole | {
         "episodes": [episode for episode in whole["episodes"] if episode["seed"] in seeds],
         "seeds": [seed for seed in whole["seeds"] if seed in seeds]}
-    errors = episode_errors(record)
+    errors = episode_scores(record)
     counts = {"failed": sum(episode["status"] != "ok" for episode in whole["episodes"]),
               "missing": len(seeds - set(record["seeds"]))}
     note = [*filter(None, [record["role"]]), *["privileged"] * record["privileged"],
@@ -373,9 +370,9 @@ def is_naive_baseline(record: dict[str, Any]) -> bool:
             and version_number(record["version"]) is not None)
 
 
-def episode_errors(record: dict[str, Any] | None) -> dict[str, float]:
-    """Return seed -> ẽ_c of a record; nothing without one."""
-    return scores_by_seed(record, "error") if record else {}
+def episode_scores(record: dict[str, Any] | None, name: str = "error") -> dict[str, float]:
+    """Return seed -> score of a record, ẽ_c by default; nothing without a record."""
+    return scores_by_seed(record, name) if record else {}
 
 
 def skill_scores(zero: dict[str, float], errors: dict[str, float]) -> dict[str, float]:
@@ -408,8 +405,8 @@ def aggregate_environments() -> set[str]:
     """Return the names of the environments of aggregates: all registered ids with their default
     arguments, without shifted environments, which have a separate leaderboard, and without
     `reference_environments`."""
-    names = {tracks.environment_name(id, {}) for id in tracks.ids() if not tracks.nominal_id(id)}
-    return names - reference_environments()
+    return {tracks.environment_name(each.id, {}) for each in entries().values()
+            if not each.nominal and not each.is_reference}
 
 
 def reference_environments() -> set[str]:
@@ -444,7 +441,7 @@ def _aggregate(category: str, made: list[Leaderboard]) -> list[Leaderboard]:
         note = ", ".join(dict.fromkeys(word for row in own for word in row.badges))
         assert own[0].record is not None
         rows.append(MethodRow(
-            dict.fromkeys(csv_fields()) | _identity_cells(own[0].record, ALL, note)
+            dict.fromkeys(own[0].cells) | _identity_cells(own[0].record, ALL, note)
             | _with_interval("gain", gains, interquartile_mean)
             | {"official": all(row.cells["official"] for row in own)}))
         if not note:

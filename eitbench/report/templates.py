@@ -8,7 +8,6 @@ import re
 from collections.abc import Callable
 from functools import lru_cache
 from typing import Any
-from urllib.parse import quote
 
 import jinja2
 from markdown_it import MarkdownIt
@@ -16,14 +15,6 @@ from markupsafe import Markup, escape
 from PIL import Image
 
 from eitbench._sanitize import escape_markdown, sanitize
-
-_DRAWING = ('<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 32 32">'
-            '<rect y="5" width="32" height="22" rx="5" fill="#0b6e75"/>'
-            '<path d="M4 21C12 12 18 20 28 11" stroke="#f0c246" stroke-width="5" fill="none"/>'
-            '</svg>')
-ICON = f"data:image/svg+xml,{quote(_DRAWING, safe='')}"
-"""Icon of the browser's tab: a pipe with a slug."""
-
 
 N_COLOURS = 12
 """--c0 … --c11 of the style sheet; further series repeat them, dashed."""
@@ -39,7 +30,7 @@ def _environment() -> jinja2.Environment:
     made = jinja2.Environment(loader=jinja2.PackageLoader("eitbench.report", "."), autoescape=True,
                               trim_blocks=True, lstrip_blocks=True, keep_trailing_newline=True,
                               undefined=jinja2.StrictUndefined, finalize=_finalize)
-    made.globals |= {"add_line_breaks": add_line_breaks, "icon": ICON, "n_colours": N_COLOURS}
+    made.globals |= {"add_line_breaks": add_line_breaks, "n_colours": N_COLOURS}
     made.filters |= {"tick": format_tick, "escape_markdown": escape_markdown}
     return made
 

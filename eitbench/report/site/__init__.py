@@ -144,7 +144,7 @@ def render(site: Site) -> dict[str, str]:
     text = render_template(
         "site/leaderboard.md.j2", families=robustness.shift_families(site.boards),
         robustness_columns=robustness.ROBUSTNESS_COLUMNS, measured=site.measured,
-        measured_columns=measured.MEASURED_COLUMNS, columns=column_descriptions(),
+        measured_columns=measured.MEASURED_COLUMNS, columns=column_descriptions(measured=False),
         classes={name: [(board, tables.markdown_table(board)) for board in boards]
                  for name, boards in site.classes.items()},
         superseded=list(map(record_file_name, split_outdated(site.records)[1])))
