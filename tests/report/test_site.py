@@ -16,7 +16,6 @@ from eitbench.bench.tracks import ids
 from eitbench.report.site import (
     HEADLINE,
     LINKS,
-    METHODS_FOLDER,
     ROBUSTNESS_PAGE,
     collect,
     documentation,
@@ -35,17 +34,23 @@ from tiny import BOARD_IDS, RUN, record, several_boards
 
 ROOT = Path(__file__).parents[2]
 BUDGET = "eitbench/Pipe2DInjectionBudget-v0"
-PICTURES = {"eitbench-Pipe2D-v0.webp": 340_000} | dict.fromkeys(HEADLINE, 1)
+PICTURES = {"media/eitbench-Pipe2D-v0.webp": 340_000} | dict.fromkeys(HEADLINE, 1)
 FLOOR = {"role": "floor", "official": True}
 
 
-def rendered(records):
-    site = collect(records)._replace(media=PICTURES)
-    return {path: content.decode() for path, content in render_site(site).items()}
+@pytest.fixture(scope="module")
+def rendered(tmp_path_factory):
+    """Return a function that renders a site next to pictures."""
+    folder = tmp_path_factory.mktemp("leaderboards")
+    for name, size in PICTURES.items():
+        (folder / name).parent.mkdir(exist_ok=True)
+        (folder / name).write_bytes(b"0" * size)
+    return lambda records: {path: content.decode() for path, content in
+                            render_site(collect(records, folder)).items()}
 
 
 @pytest.fixture(scope="module")
-def site():
+def site(rendered):
     """Return a site of several leaderboards, with an animation."""
     return rendered(several_boards())
 
@@ -72,7 +77,7 @@ def test_published_files_are_rendered_from_the_records():
     assert len(published["site/index.html"]) < 1e6 and sum(map(len, published.values())) < 15e6
 
 
-def test_the_same_records_give_the_same_bytes(site):
+def test_the_same_records_give_the_same_bytes(site, rendered):
     assert rendered(list(reversed(several_boards()))) == site
 
 
@@ -123,7 +128,7 @@ def test_numbers_are_those_of_the_boards(pages):
     assert [rank for rank in ranks if rank.startswith("1")] == ["1 tied", "1 tied"]
 
 
-def test_reference_environments_have_their_tables_on_their_pages_only():
+def test_reference_environments_have_their_tables_on_their_pages_only(rendered):
     """The index names and links them."""
     id = "eitbench/Pipe2DInjection-v0"
     pages = rendered([*several_boards(), record("greedy_a", [0.1, 0.2], id=id, board="injection")])
@@ -132,7 +137,7 @@ def test_reference_environments_have_their_tables_on_their_pages_only():
     assert 'id="board-injection-eitbench-Pipe2DInjection-v0"' not in pages["index.html"]
 
 
-def test_a_methods_page_has_every_episode_and_its_provenance(pages):
+def test_a_methods_page_has_every_episode_and_its_provenance(pages, rendered):
     """A method's page has recorded seeds, errors, failures, parameters, commands, and each machine once."""
     html = pages["methods/failing.html"]
     assert all(f">test:{i}</td>" in html for i in range(8)) and "RuntimeError: oh" in html and "1 failed" in html
@@ -148,7 +153,7 @@ def test_a_methods_page_has_every_episode_and_its_provenance(pages):
     assert text.count("An abacus") == 1 and "matrix product 50 to 60 ms" in text
 
 
-def test_docstrings_and_files_are_of_the_recorded_version():
+def test_docstrings_and_files_are_of_the_recorded_version(rendered):
     """A built-in method's description is shown only if the file is unchanged; an agent's file only if it is equal."""
     content = (ROOT / "baselines" / "kalman_filter.py").read_bytes()
     same = record("kalman_filter", [0.1], method_sha256=hashlib.sha256(content).hexdigest())
@@ -164,7 +169,7 @@ def test_docstrings_and_files_are_of_the_recorded_version():
         assert (file in rendered([agent])["methods/maskable_ppo_seed0.html"]) == (digest == ours)
 
 
-def test_agents_of_several_environments_have_no_common_title():
+def test_agents_of_several_environments_have_no_common_title(rendered):
     """Their page has the name as its heading; agents of one environment have a title."""
     one, other = (record("ppo_seed0", of(0.5), id=id, board="injection", title=f"imitation in {id}",
                          parameters={"env": id}) for id in (BUDGET, "eitbench/TankTracking-v0"))
@@ -283,7 +288,7 @@ def test_robustness_by_hand():
     assert shift_heading("me/WeakWorn-v0", "me/Weak-v0") == "worn" and shift_heading(SHORT, HOME) == "short slugs"
 
 
-def test_robustness_is_on_the_site_and_in_the_text(pages):
+def test_robustness_is_on_the_site_and_in_the_text(pages, rendered):
     files, text = rendered(shifted()), render(collect(shifted()))["leaderboard.md"]
     assert f'href="{ROBUSTNESS_PAGE}"' in files["index.html"] and ROBUSTNESS_PAGE not in pages
     for id in (SHORT, NOISE):
@@ -302,7 +307,7 @@ def headlined(errors, official=True, **changes):
                    role="floor" if name == "homogeneous" else None, **changes) for name, error in errors.items()]
 
 
-def test_the_headline_is_computed():
+def test_the_headline_is_computed(rendered):
     """The ratio of 37 and 4 is nine; key figures are skill scores of the best filter, trained agent and rule."""
     found = text_of(rendered(headlined(ERRORS))["index.html"])
     for expected in ("A flow model reduces the error ninefold", "5.0 ×", "error of 0.037", "flow model 0.0040",
@@ -320,7 +325,7 @@ def test_the_headline_is_computed():
 @pytest.mark.parametrize(("errors", "official"), [
     ({name: error for name, error in ERRORS.items() if name != "gauss_newton"}, True),
     (ERRORS | {"gauss_newton": 0.006}, True), (ERRORS | {"gauss_newton": 0.9}, True), (ERRORS, False)])
-def test_no_headline_where_it_would_not_be_true(errors, official):
+def test_no_headline_where_it_would_not_be_true(errors, official, rendered):
     """A missing method, a ratio out of range, or self-reported records give no headline."""
     records = headlined(errors, official)
     assert headline(collect(records)) is None and "<figure>" not in rendered(records)["index.html"]
@@ -352,8 +357,7 @@ def test_every_link_resolves(site, pages):
 def test_links_to_files_of_the_repository(tmp_path):
     """Links to files of the repository exist."""
     folder = tmp_path / "leaderboards"
-    for name in (LINKS["Submit a method"], LINKS["Code"], f"{METHODS_FOLDER}/kalman_filter.py", *(
-            f"media/{name}" for name in HEADLINE)):
+    for name in (LINKS["Submit a method"], LINKS["Code"], "../baselines/kalman_filter.py", *HEADLINE):
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
         (folder / name).write_text("")
     records = [*headlined(ERRORS), record("kalman_filter", [0.1], version="v1", official=True)]

@@ -11,6 +11,7 @@ import ast
 import json
 import re
 from collections.abc import Iterable, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -55,14 +56,11 @@ HEADLINE_METHODS = ("homogeneous", "gauss_newton", "extended_kalman_filter")
 MULTIPLES = dict(enumerate(("two", "three", "four", "five", "six", "seven", "eight", "nine", "ten",
                             "eleven", "twelve"), 2))
 ROBUSTNESS_PAGE, MEASURED_PAGE = "robustness.html", "measured.html"
-HEADLINE = "headline.webp", "headline.png"
-"""Animation of the first page, and its still picture. Others are named like an environment, as in
-eitbench-Pipe2D-v0.webp."""
+HEADLINE = "media/headline.webp", "media/headline.png"
+"""Animation of the first page, and its still picture, from the leaderboards' folder."""
 LINKS = {"Submit a method": "README.md", "Statistics": "../docs/statistics.md",
          "Code": "../README.md"}
 """Link of every page -> file, from the leaderboards' folder."""
-METHODS_FOLDER = "../baselines"
-"""Folder of the built-in methods, from the leaderboards' folder."""
 SITE_MARKER = b"<strong>eitbench</strong> leaderboards"
 """Text by which the index.html of a site is recognised."""
 
@@ -75,10 +73,8 @@ class Site(NamedTuple):
     records: list[dict[str, Any]]
     """Sorted; superseded ones included."""
     measured: measured.MeasuredBoards = measured.EMPTY
-    media: Mapping[str, int] = {}
-    """Name of each picture in the folder ``media`` next to the site -> bytes."""
-    assets: frozenset[str] = frozenset()
-    """Those of `LINKS` and `METHODS_FOLDER` that exist."""
+    folder: Path | None = None
+    """Folder of the leaderboards, which will hold the site; pages link to files around it."""
 
     @property
     def classes(self) -> dict[str, list[Leaderboard]]:
@@ -93,29 +89,24 @@ class Site(NamedTuple):
         return next((board for board in self.boards
                      if (board.category, board.environment) == (category, environment)), None)
 
+    def address(self, name: str, root: str = "") -> str:
+        """Return the address of a file, given by its path from the leaderboards' folder, from a
+        page from which ``root`` leads to the site; empty if the file is missing."""
+        return f"{root}../{name}" if self.folder and (self.folder / name).exists() else ""
+
     def page(self, kind: str, root: str = "", /, **contents: Any) -> bytes:
         """Render a template of the site for a page from which ``root`` leads to the site."""
-        links = {words: f"{root}../{name}" for words, name in LINKS.items() if name in self.assets}
+        links = {words: self.address(name, root) for words, name in LINKS.items()}
         return render_template(f"site/{kind}.html.j2", root=root, links=links, **contents)
-
-    def picture(self, name: str, root: str) -> str:
-        """Return the address of a picture; empty if it is missing."""
-        return f"{root}../media/{name}" if name in self.media else ""
 
 
 def collect(records: Iterable[dict[str, Any]], folder: Path | None = None) -> Site:
-    """Return the site of the records, and of the measured records, pictures and files that it finds
-    in a ``folder`` of leaderboards and in the checkout around it."""
+    """Return the site of the records, and of the measured records in a ``folder`` of leaderboards.
+    """
     ordered = sorted(records, key=lambda record: (
         record["environment"]["name"], record["method"], record["version"]))
-    site = Site(leaderboards(ordered), ordered)
-    if folder is None:
-        return site
-    media = {path.name: path.stat().st_size for path in sorted((folder / "media").glob("*.*"))
-             if path.suffix in (".webp", ".png")}
-    assets = frozenset(name for name in (*LINKS.values(), METHODS_FOLDER)
-                       if (folder / name).exists())
-    return site._replace(measured=measured.MeasuredBoards.of(folder), media=media, assets=assets)
+    found = measured.MeasuredBoards.of(folder) if folder else measured.EMPTY
+    return Site(leaderboards(ordered), ordered, found, folder)
 
 
 def render_site(site: Site) -> dict[str, bytes]:
@@ -186,7 +177,7 @@ def index_page(site: Site) -> bytes:
                   for name, boards in site.classes.items()}
     return site.page(
         "index", headline=headline(site), **key_figures(site),
-        moving=site.picture(HEADLINE[0], ""), still=site.picture(HEADLINE[1], ""),
+        moving=site.address(HEADLINE[0]), still=site.address(HEADLINE[1]),
         n_environments=sum(not board.is_aggregate for board in site.boards),
         n_records=len(site.records),
         n_methods=len({record["method"] for record in site.records}), classes=shown,
@@ -235,14 +226,15 @@ def environment_page(site: Site, board: Leaderboard) -> bytes:
     id = board.records[0]["environment"]["id"]
     table = tables.page_table(board, "../")
     description, details = documentation(id)
-    animation = f"{board.environment}.webp"
+    animation = f"media/{board.environment}.webp"
+    moving = site.address(animation, "../")
+    size = (site.folder / animation).stat().st_size if site.folder and moving else 0
     return site.page(
         "environment", "../", board=board, id=id, description=description, details=details,
         table=table, axes=tables.score_axes(board),
         explanations=tables.explanations([table]),
         front=tables.cost_chart(board), curves=tables.curve_chart(board),
-        moving=site.picture(animation, "../"),
-        media_mb=f"{1e-6 * site.media.get(animation, 0):.1f} MB",
+        moving=moving, media_mb=f"{1e-6 * size:.1f} MB",
         robustness=(ROBUSTNESS_PAGE
                     if nominal_id(id) and environment_name(id, {}) == board.environment else ""),
         siblings=[other for other in site.classes[board.category]
@@ -265,8 +257,6 @@ def method_page(site: Site, name: str) -> bytes:
                      key=lambda record: (record["official"], finished_at(record)), reverse=True)
     placements = [(board, row) for boards in site.classes.values() for board in boards
                   for row in board.rows if row.cells["method"] == name]
-    addresses = {(row.cells["environment"], row.cells["version"]): board.address
-                 for board, row in placements}
     versions: dict[tuple[str, str], list[dict[str, Any]]] = {}
     for record in records:              # agents of several environments share name and version
         key = record["version"], str(record["parameters"].get("env"))
@@ -275,9 +265,12 @@ def method_page(site: Site, name: str) -> bytes:
     # agents of several environments have no common title
     title = name if len({env for _, env in versions}) > 1 else records[0]["title"]
     return site.page(
-        "method", "../", name=name, title=title, placements=table, axes=axes,
-        checkout="../../../" if METHODS_FOLDER in site.assets else "",
-        versions=[_version(own, addresses) for own in versions.values()])
+        "method", "../", site=site, name=name, title=title, placements=table, axes=axes,
+        versions=[(own, *_source(own[0])) for own in versions.values()],
+        addresses={(row.cells["environment"], row.cells["version"]): board.address
+                   for board, row in placements},
+        episode_table=_episodes, environment_title=environment_title, group_runs=group_runs,
+        record_file_name=record_file_name, to_json=partial(json.dumps, ensure_ascii=False))
 
 
 def _placements(placements: list[tuple[Leaderboard, MethodRow]]) -> tuple[Table, dict[str, Axis]]:
@@ -298,29 +291,6 @@ def _placements(placements: list[tuple[Leaderboard, MethodRow]]) -> tuple[Table,
             "ms/step": number_cell(row.cells["seconds_per_step"])})
     table = Table.of(rows, label="Results", keep=list(rows[0]) if rows else ())
     return table, {"skill score": gains}
-
-
-def _version(records: list[dict[str, Any]], addresses: dict[tuple[str, str], str],
-             ) -> dict[str, Any]:
-    """Return the properties of one version, and its records."""
-    record = records[0]
-    file, docstring = _source(record)
-    shown = []
-    for each in sorted(records, key=lambda record: record["environment"]["name"]):
-        runs = [group[0] | {"products": sorted(1000 * run["machine"]["matmul_seconds"]
-                                               for run in group)}
-                for group in group_runs(each["runs"])]
-        shown.append({
-            "title": environment_title(each), "official": each["official"], "runs": runs,
-            "file": record_file_name(each), "episodes": _episodes(each),
-            "address": addresses.get((each["environment"]["name"], each["version"])),
-            "commands": sorted({run["command"] for run in each["runs"]}),
-            "failures": [episode for episode in each["episodes"] if episode["status"] != "ok"]})
-    return {"name": record["version"], "sha256": record["method_sha256"],
-            "checkpoint": record["checkpoint_sha256"], "file": file, "docstring": docstring,
-            "records": shown,
-            "parameters": {key: json.dumps(value, ensure_ascii=False)
-                           for key, value in sorted(record["parameters"].items())}}
 
 
 def _episodes(record: dict[str, Any]) -> Table:
