@@ -60,17 +60,15 @@ def find_records(name: str, folder: Path) -> list[dict[str, Any]]:
     for place in dict.fromkeys(map(Path.resolve, (folder, BUNDLED_RECORDS, OWN_RECORDS))):
         there = read_records(place)
         known |= {record["method"] for record in there}
-        if not version:
-            there = split_outdated(there)[0]
-        own = [record for record in there
+        current = there if version else split_outdated(there)[0]
+        own = [record for record in current
                if record["method"] == method and version in ("", record["version"])]
         if not version:
             own = [record for record in own if record["official"]] or own or mean_over_trainings(
-                [record for record in there if agent_name(record["method"]) == method])
-        versions = sorted({record["version"] for record in own})
+                [record for record in current if agent_name(record["method"]) == method])
+        versions = sorted({f"{method}@{record['version']}" for record in own})
         if len(versions) > 1:
-            found = ", ".join(f"{method}@{each}" for each in versions)
-            raise ValueError(f"{name} fits several versions: {found}")
+            raise ValueError(f"{name} fits several versions: {', '.join(versions)}")
         if own:
             return own
     raise ValueError(f"record of {name} not found in {folder}, the package, or {OWN_RECORDS}"
@@ -88,7 +86,7 @@ def mean_over_trainings(records: list[dict[str, Any]]) -> list[dict[str, Any]]:
         found = {name: mean_by_seed([scores_by_seed(each, name) for each in trainings])
                  for name in scores()}
         episodes = [{"seed": seed, "status": "ok", "scores": {
-            name: own[seed] for name, own in found.items() if seed in own}}
+            name: own[seed] / scores()[name].factor for name, own in found.items() if seed in own}}
             for seed in found["error"]]
         means.append(trainings[0] | {
             "method": agent_name(trainings[0]["method"]), "episodes": episodes,

@@ -67,6 +67,7 @@ def test_an_agent_is_the_mean_of_its_trainings(tmp_path):
     assert table["a"].item() == pytest.approx(errors[:2, :7].mean()) and table["episodes"].item() == 7
     (mean,) = find_records("ppo", tmp_path)
     assert (mean["method"], mean["version"]) == ("ppo", "mean over trainings")
+    assert compare([mean], [mean], "seconds_per_step")["a"].item() == pytest.approx(10.0)             # ms
 
 
 def test_over_environments_gains_are_compared():

@@ -52,9 +52,8 @@ class MeasuredBoards(NamedTuple):
             case = read_case(registered_kwargs(id)["case"])
             cases[case.name] = case
             records.setdefault(case.name, []).append(record)
-        for own in records.values():
-            own.sort(key=withheld_rmse)
-        return cls(cases, records, complaints)
+        return cls(cases, {name: sorted(own, key=withheld_rmse) for name, own in records.items()},
+                   complaints)
 
     def case_table(self, name: str) -> Table:
         """Return the table of the methods of a case."""
