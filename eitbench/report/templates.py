@@ -7,7 +7,7 @@ import io
 import re
 from collections.abc import Callable
 from functools import lru_cache
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jinja2
 from markdown_it import MarkdownIt
@@ -15,6 +15,9 @@ from markupsafe import Markup, escape
 from PIL import Image
 
 from eitbench._sanitize import escape_markdown, sanitize
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 N_COLOURS = 12
 """--c0 … --c11 of the style sheet; further series repeat them, dashed."""
@@ -72,6 +75,13 @@ def markdown(text: str) -> Markup:
     html = reader.renderer.render(tokens, reader.options, {})
     begin = '<div class="card" tabindex="0" role="region" aria-label="table"><table>'
     return Markup(html.replace("<table>", begin).replace("</table>", "</table></div>"))
+
+
+def figure_image(figure: Figure) -> Image.Image:
+    """Return a figure as a picture."""
+    content = io.BytesIO()
+    figure.savefig(content, format="png")
+    return Image.open(content)
 
 
 def data_uri(image: Image.Image, kind: str = "png", **options: Any) -> str:
