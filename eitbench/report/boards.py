@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from pathlib import Path
 from statistics import median
 from typing import Any, NamedTuple
@@ -332,9 +332,7 @@ def _with_ranks(rows: list[MethodRow], scores: Mapping[str, Scores], **options: 
 def _row(whole: dict[str, Any], seeds: set[str], zero: dict[str, float], known: Anchors,
          products: dict[str, float]) -> MethodRow:
     """Return the row of a record on the board with these seeds, without its rank."""
-    record = whole | {
-        "episodes": [episode for episode in whole["episodes"] if episode["seed"] in seeds],
-        "seeds": [seed for seed in whole["seeds"] if seed in seeds]}
+    record = restrict(whole, seeds)
     errors = episode_scores(record)
     counts = {"failed": sum(episode["status"] != "ok" for episode in whole["episodes"]),
               "missing": len(seeds - set(record["seeds"]))}
@@ -349,6 +347,13 @@ def _row(whole: dict[str, Any], seeds: set[str], zero: dict[str, float], known: 
         cells[name] = float(reduce(values)) if values else None
     cells |= _costs(record, products)
     return MethodRow(cells, record, skill_scores(zero, errors))
+
+
+def restrict(record: dict[str, Any], seeds: Collection[str]) -> dict[str, Any]:
+    """Return a record with only the episodes that have one of these seeds."""
+    return record | {
+        "episodes": [episode for episode in record["episodes"] if episode["seed"] in seeds],
+        "seeds": [seed for seed in record["seeds"] if seed in seeds]}
 
 
 def _identity_cells(record: dict[str, Any], environment: str, note: str) -> dict[str, Any]:

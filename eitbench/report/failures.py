@@ -11,6 +11,7 @@ from eitbench.bench.run import Job
 from eitbench.bench.store import EpisodeStore
 from eitbench.bench.text import seed_ranges
 from eitbench.data.seeds import format_seed
+from eitbench.report.boards import restrict
 
 
 class Failure(NamedTuple):
@@ -32,15 +33,13 @@ class Failure(NamedTuple):
 def select_requested(records: Iterable[dict[str, Any]], jobs: Iterable[Job],
                      ) -> list[dict[str, Any]]:
     """Return the records restricted to the episodes of these jobs."""
-    asked = {_key(job) for job in jobs}
-    found = []
-    for record in records:
-        place = record["environment"]["name"], record["method"]
-        episodes = [each for each in record["episodes"] if (*place, each["seed"]) in asked]
-        if episodes:
-            found.append(record | {"episodes": episodes,
-                                   "seeds": [each["seed"] for each in episodes]})
-    return found
+    asked: dict[tuple[str, str], set[str]] = {}
+    for job in jobs:
+        name = job.environment.name, job.load().name
+        asked.setdefault(name, set()).add(format_seed(job.seed))
+    found = (restrict(record, asked.get((record["environment"]["name"], record["method"]), ()))
+             for record in records)
+    return [record for record in found if record["episodes"]]
 
 
 def failures(store: EpisodeStore, records: Iterable[dict[str, Any]]) -> list[Failure]:
@@ -54,8 +53,3 @@ def failures(store: EpisodeStore, records: Iterable[dict[str, Any]]) -> list[Fai
                 seeds.setdefault(error, []).append(episode["seed"])
         found += [Failure(record, those, *error) for error, those in seeds.items()]
     return found
-
-
-def _key(job: Job) -> tuple[str, str, str]:
-    """Environment, method and seed, as records name them."""
-    return job.environment.name, job.load().name, format_seed(job.seed)
