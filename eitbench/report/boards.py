@@ -269,7 +269,7 @@ def leaderboards(records: list[dict[str, Any]]) -> list[Leaderboard]:
     for name in tracks.CATEGORIES:
         members = [record for record in current if record_category(record) == name]
         made = _boards(members, current, known, ranked=True)
-        found += [*made, *_aggregate(name, _aggregate_boards(made))]
+        found += [*made, *_aggregate(name, made)]
     return found
 
 
@@ -421,19 +421,18 @@ def reference_environments() -> set[str]:
             if each.is_reference}
 
 
-def _aggregate_boards(made: list[Leaderboard]) -> list[Leaderboard]:
-    """Return the leaderboards of an aggregate: with a naive baseline, an official one where
-    it exists, since a third-party baseline could exclude all other methods."""
-    names = aggregate_environments()
-    own = [board for board in made if board.environment in names
-           and any(row.skill_scores for row in board.rows)]
-    return [board for board in own if any(
-        is_naive_baseline(record) and record["official"] for record in board.records)] or own
-
-
 def _aggregate(category: str, made: list[Leaderboard]) -> list[Leaderboard]:
     """Return the methods that have finished all of several environments, ordered and ranked by the
-    interquartile mean of their skill scores."""
+    interquartile mean of their skill scores.
+
+    The naive baselines are official ones where they exist, since a third-party baseline could
+    exclude all other methods.
+    """
+    names = aggregate_environments()
+    made = [board for board in made if board.environment in names
+            and any(row.skill_scores for row in board.rows)]
+    made = [board for board in made if any(
+        is_naive_baseline(record) and record["official"] for record in board.records)] or made
     if len(made) < 2:
         return []
     found = [{row.label: row for row in board.rows if row.complete and row.skill_scores}

@@ -11,12 +11,7 @@ import pandas as pd
 
 from eitbench import _check
 from eitbench._files import bundled_path, resolve_input
-from eitbench.bench.records import (
-    finished_at,
-    read_record,
-    read_records,
-    split_outdated,
-)
+from eitbench.bench.records import finished_at, read_record, read_records, split_outdated
 from eitbench.bench.scores import scores
 from eitbench.bench.statistics import (
     Statistic,

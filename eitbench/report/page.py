@@ -1,13 +1,15 @@
-"""One self-contained HTML page of results: tables, charts, pictures, failures, and sweeps."""
+"""One self-contained HTML page of results: tables, charts, pictures, failures, and sweeps. Failures
+are errors of a method in episodes of a run."""
 
 from __future__ import annotations
 
 import json
+import textwrap
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -15,25 +17,67 @@ from matplotlib.figure import Figure
 
 from eitbench import _check
 from eitbench._files import write_atomically
+from eitbench._sanitize import sanitize
 from eitbench.bench import tracks
 from eitbench.bench.records import group_runs
+from eitbench.bench.run import Job
 from eitbench.bench.store import EpisodeStore
 from eitbench.bench.text import seed_ranges
 from eitbench.bench.tracks import Environment
 from eitbench.data.episode_cache import truth_mesh
 from eitbench.data.episodes import simulate
-from eitbench.data.seeds import parse_seeds
+from eitbench.data.seeds import format_seed, parse_seeds
 from eitbench.envs.rendering import FIELD_COLORMAP, colour_range, draw_field
 from eitbench.numerics.mesh import Mesh
 from eitbench.report import tables
-from eitbench.report.boards import Leaderboard, episode_scores
-from eitbench.report.failures import failures
+from eitbench.report.boards import Leaderboard, episode_scores, restrict
 from eitbench.report.sweep import Sweep
 from eitbench.report.templates import data_uri, figure_image, render_template
 from eitbench.worlds.task import Task
 
 N_SNAPSHOT_METHODS, N_SNAPSHOT_TIMES = 3, 4
 """Methods and states in the pictures of an episode."""
+
+
+class Failure(NamedTuple):
+    """One error of a method in some episodes of a record."""
+
+    record: dict[str, Any]
+    seeds: list[str]
+    message: str
+    traceback: str
+    """Lines of the method's own code; empty if the error was raised elsewhere."""
+
+    def __str__(self) -> str:
+        environment = self.record["environment"]["id"]
+        where = f"{self.record['method']} in {environment} on {seed_ranges(self.seeds)}"
+        return f"failed: {where}: {sanitize(self.message)}" + (
+            "\n" + textwrap.indent(self.traceback.rstrip(), "  ") if self.traceback else "")
+
+
+def select_requested(records: Iterable[dict[str, Any]], jobs: Iterable[Job],
+                     ) -> list[dict[str, Any]]:
+    """Return the records restricted to the episodes of these jobs."""
+    asked: dict[tuple[str, str], set[str]] = {}
+    for job in jobs:
+        name = job.environment.name, job.load().name
+        asked.setdefault(name, set()).add(format_seed(job.seed))
+    found = (restrict(record, asked.get((record["environment"]["name"], record["method"]), ()))
+             for record in records)
+    return [record for record in found if record["episodes"]]
+
+
+def failures(store: EpisodeStore, records: Iterable[dict[str, Any]]) -> list[Failure]:
+    """Return the failures of records of a store, in their order."""
+    found = []
+    for record in records:
+        seeds: dict[tuple[str, str], list[str]] = {}
+        for episode in record["episodes"]:
+            if episode["status"] != "ok":
+                error = episode["message"], store.traceback(record, episode["seed"])
+                seeds.setdefault(error, []).append(episode["seed"])
+        found += [Failure(record, those, *error) for error, those in seeds.items()]
+    return found
 
 
 def write_page(store: EpisodeStore, boards: Sequence[Leaderboard],

@@ -136,8 +136,7 @@ def render(site: Site) -> dict[str, str]:
         "site/leaderboard.md.j2", families=robustness.shift_families(site.boards),
         robustness_columns=robustness.ROBUSTNESS_COLUMNS, measured=site.measured,
         measured_columns=measured.MEASURED_COLUMNS, columns=column_descriptions(measured=False),
-        classes={name: [(board, tables.markdown_table(board)) for board in boards]
-                 for name, boards in site.classes.items()},
+        classes=site.classes, markdown_table=tables.markdown_table,
         superseded=list(map(record_file_name, split_outdated(site.records)[1])))
     table = leaderboard_table(site.boards).replace({"environment": {
         record["environment"]["name"]: qualified_name(record["environment"])
@@ -169,24 +168,16 @@ def write_site(folder: Path, files: Mapping[str, bytes]) -> None:
 def index_page(site: Site) -> bytes:
     """Return the HTML of ``index.html``."""
     apart = reference_environments()
-    shown = {name: [(board, tables.page_table(board, "", compact=True),
-                     tables.score_axes(board)) for board in boards
-                    if board.environment not in apart]
-             for name, boards in site.classes.items()}
-    references = {name: [board for board in boards if board.environment in apart]
-                  for name, boards in site.classes.items()}
+    shown = {board.anchor: tables.page_table(board, "", compact=True) for board in site.boards
+             if board.environment not in apart}
     return site.page(
-        "index", headline=headline(site), **key_figures(site),
+        "index", site=site, headline=headline(site), **key_figures(site),
         moving=site.address(HEADLINE[0]), still=site.address(HEADLINE[1]),
-        n_environments=sum(not board.is_aggregate for board in site.boards),
-        n_records=len(site.records),
-        n_methods=len({record["method"] for record in site.records}), classes=shown,
-        references=references, about=CATEGORY_TEXTS,
+        tables=shown, score_axes=tables.score_axes, about=CATEGORY_TEXTS,
         robustness=ROBUSTNESS_PAGE if robustness.shift_families(site.boards) else "",
         measured=MEASURED_PAGE if site.measured.records else "",
         last=max(map(finished_at, site.records), default="")[:10],
-        explanations=tables.explanations(table for boards in shown.values()
-                                         for _, table, _ in boards))
+        explanations=tables.explanations(shown.values()))
 
 
 def headline(site: Site) -> dict[str, Any] | None:
