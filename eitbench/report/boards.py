@@ -29,6 +29,7 @@ from eitbench.bench.records import (
 from eitbench.bench.scores import scores
 from eitbench.bench.statistics import (
     Scores,
+    Statistic,
     agent_name,
     interquartile_mean,
     mean_by_seed,
@@ -259,10 +260,9 @@ def leaderboards(records: list[dict[str, Any]]) -> list[Leaderboard]:
     finished every episode of all `aggregate_environments` with a naive baseline (an official one
     where it exists), if there are several. ``seconds_per_step`` is of the fastest episode.
     """
-    for record in records:
-        if record["split"] != "test":
-            raise ValueError("leaderboards are made of test seeds; "
-                             f"{record_file_name(record)} has {record['split']} seeds")
+    if other := next((record for record in records if record["split"] != "test"), None):
+        raise ValueError("leaderboards are made of test seeds; "
+                         f"{record_file_name(other)} has {other['split']} seeds")
     current, _ = split_outdated(records)
     known = anchors(current)
     found: list[Leaderboard] = []
@@ -334,18 +334,17 @@ def _row(whole: dict[str, Any], seeds: set[str], zero: dict[str, float], known: 
     """Return the row of a record on the board with these seeds, without its rank."""
     record = restrict(whole, seeds)
     errors = episode_scores(record)
-    counts = {"failed": sum(episode["status"] != "ok" for episode in whole["episodes"]),
-              "missing": len(seeds - set(record["seeds"]))}
-    note = [*filter(None, [record["role"]]), *["privileged"] * record["privileged"],
-            *(f"{count} {what}" for what, count in counts.items() if count)]
-    cells = _identity_cells(record, record["environment"]["name"], ", ".join(note))
-    cells |= error_and_skill(errors, zero)
-    cells |= {"seeds": seed_ranges(record["seeds"]), "skill": _normalised_score(record, known)}
+    failed = sum(episode["status"] != "ok" for episode in whole["episodes"])
+    missing = len(seeds - set(record["seeds"]))
+    note = [record["role"], "privileged" * record["privileged"], f"{failed} failed" * bool(failed),
+            f"{missing} missing" * bool(missing)]
+    cells = _identity_cells(record, record["environment"]["name"], ", ".join(filter(None, note)))
     for name in (scores() | scores("measured")).keys() - {"error"}:
         values = list(scores_by_seed(record, name).values())
         reduce: Any = min if name == "seconds_per_step" else np.mean
         cells[name] = float(reduce(values)) if values else None
-    cells |= _costs(record, products)
+    cells |= error_and_skill(errors, zero) | _costs(record, products) | {
+        "seeds": seed_ranges(record["seeds"]), "skill": _normalised_score(record, known)}
     return MethodRow(cells, record, skill_scores(zero, errors))
 
 
@@ -392,15 +391,15 @@ def error_and_skill(errors: dict[str, float], zero: dict[str, float]) -> dict[st
 
 
 def _with_interval(name: str, values: dict[str, dict[str, float]],
-                   statistic: Any) -> dict[str, float | None]:
+                   statistic: Statistic) -> dict[str, float | None]:
     """Return a statistic of environment -> seed -> score, ``name``, and the ends of its 95 %
     interval, ``name_low`` and ``name_high``; None where unknown."""
-    keys = (name, f"{name}_low", f"{name}_high")
-    if not all(values.values()):
-        return dict.fromkeys(keys)
-    three = stratified_bootstrap({key: list(own.values()) for key, own in values.items()},
-                                 statistic)
-    return dict(zip(keys, (each if math.isfinite(each) else None for each in three), strict=True))
+    three: Iterable[float | None] = (None, None, None)
+    if all(values.values()):
+        strata = {key: list(own.values()) for key, own in values.items()}
+        three = (each if math.isfinite(each) else None
+                 for each in stratified_bootstrap(strata, statistic))
+    return dict(zip((name, f"{name}_low", f"{name}_high"), three, strict=True))
 
 
 # -- aggregates ------------------------------------------------------------------------------------
@@ -437,8 +436,7 @@ def _aggregate(category: str, made: list[Leaderboard]) -> list[Leaderboard]:
         return []
     found = [{row.label: row for row in board.rows if row.complete and row.skill_scores}
              for board in made]
-    rows = []
-    competing = {}
+    rows, competing = [], {}
     for label in set.intersection(*map(set, found)):
         own = [each[label] for each in found]
         gains = {board.environment: row.skill_scores for board, row in zip(made, own, strict=True)}
@@ -450,10 +448,9 @@ def _aggregate(category: str, made: list[Leaderboard]) -> list[Leaderboard]:
             | {"official": all(row.cells["official"] for row in own)}))
         if not note:
             competing[label] = gains
-    rows.sort(key=MethodRow.place)
-    board = Leaderboard(category, ALL, "All environments", _with_ranks(
-        rows, competing, statistic=interquartile_mean, higher_is_better=True))
-    return [board] if rows else []
+    ranked = _with_ranks(sorted(rows, key=MethodRow.place), competing,
+                         statistic=interquartile_mean, higher_is_better=True)
+    return [Leaderboard(category, ALL, "All environments", ranked)] if rows else []
 
 
 # -- records ---------------------------------------------------------------------------------------
@@ -463,10 +460,9 @@ def read_leaderboard_records(folder: Path) -> tuple[list[dict[str, Any]], list[s
     """Return the records of a folder, and one message for each record that leaderboards leave out,
     since it is invalid or has other seeds than test. ``ValueError`` if no other record exists."""
     read, complaints = read_valid_files(folder)
-    others = [f"record {path} has {record['split']} seeds, and leaderboards are made of test seeds"
-              for path, record in read.items() if record["split"] != "test"]
-    complaints += others
-    if len(others) == len(read):
+    complaints += [f"record {path} has {record['split']} seeds, and leaderboards are made of test "
+                   "seeds" for path, record in read.items() if record["split"] != "test"]
+    if all(record["split"] != "test" for record in read.values()):
         raise ValueError("; ".join([f"records must be a folder with records of test seeds, got "
                                     f"{folder}, which holds no valid record of test seeds",
                                     *complaints]))
@@ -517,9 +513,9 @@ def _matmul_seconds(records: Iterable[dict[str, Any]]) -> dict[str, float]:
     where there are any, since a single one depends on the load."""
     timed: dict[str, dict[bool, list[float]]] = {}
     for record in records:
-        for run in record["runs"]:
-            by = timed.setdefault(run["machine"]["processor"], {True: [], False: []})
-            by[record["official"]].append(run["machine"]["matmul_seconds"])
+        for machine in (run["machine"] for run in record["runs"]):
+            by = timed.setdefault(machine["processor"], {True: [], False: []})
+            by[record["official"]].append(machine["matmul_seconds"])
     return {processor: median(by[True] or by[False]) for processor, by in timed.items()}
 
 

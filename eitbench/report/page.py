@@ -104,7 +104,7 @@ def _snapshots(store: EpisodeStore, board: Leaderboard) -> dict[str, Any] | None
     chosen = [row.record for row in sorted(board.rows, key=lambda row: row.is_builtin)
               if row.record and episode_scores(row.record) and "floor" not in row.badges]
     chosen = chosen[:N_SNAPSHOT_METHODS]
-    shared = set.intersection(*(set(episode_scores(record)) for record in chosen or [None]))
+    shared = set.intersection(*(set(episode_scores(each)) for each in chosen)) if chosen else ()
     environment = board.records[0]["environment"]
     if not shared or environment["id"] not in tracks.ids():  # its module may not be imported
         return None
