@@ -41,12 +41,8 @@ def find_records(name: str, folder: Path) -> list[dict[str, Any]]:
     """Return the record in the file NAME.json, or the records METHOD or METHOD@VERSION of the
     first of these that has any: a folder, the package, `OWN_RECORDS`. Without a version the current
     official records are returned, or else the other current ones. The name of an agent without
-    training seed, such as ppo, selects its `mean_over_trainings`.
-
-    Raises
-    ------
-    ValueError
-        If no record matches, or records of several versions match.
+    training seed, such as ppo, selects its `mean_over_trainings`. ``ValueError`` if no record
+    matches, or records of several versions match.
     """
     if name.endswith(".json"):
         return [read_record(resolve_input(Path(name)))]
@@ -114,10 +110,7 @@ def compare(a: list[dict[str, Any]], b: list[dict[str, Any]], score: str = "erro
         better_low and better_high of its interval. Over several environments interquartile means
         of skill scores, or means of the environments' means.
 
-    Raises
-    ------
-    ValueError
-        If the score is unknown, or the methods share no finished episode with this score.
+    ``ValueError`` if the score is unknown, or the methods share no finished episode with it.
     """
     known = {each.name: each.direction for each in scores().values()}
     _check.choice("score", score, [name for name in known if known[name] in ("lower", "higher")])
@@ -174,16 +167,9 @@ def _row(label: str, score: str, pairs: dict[str, Pair], statistic: Statistic, *
             **dict(zip(("better", "better_low", "better_high"), better, strict=True))}
 
 
-def display_names(a: dict[str, Any], b: dict[str, Any]) -> tuple[str, str]:
-    """Return the names of two records' methods, with versions if they are the same."""
-    if a["method"] != b["method"]:
-        return a["method"], b["method"]
-    return f"{a['method']}@{a['version']}", f"{b['method']}@{b['version']}"
-
-
-def comparison_table(table: pd.DataFrame, a: str, b: str, score: str = "error") -> Table:
-    """Return the comparison of methods named ``a`` and ``b``; column better has the name of the
-    better one where the 95 % interval of the advantage of a excludes zero."""
+def comparison_table(table: pd.DataFrame, score: str = "error") -> Table:
+    """Return the comparison of the methods A and B; column better has the name of the better one
+    where the 95 % interval of the advantage of A excludes zero."""
     rows = []
     for row in table.to_dict("records"):
         share = f"{100 * row['better']:.0f} %"
@@ -192,20 +178,23 @@ def comparison_table(table: pd.DataFrame, a: str, b: str, score: str = "error") 
         kind = f"{SKILL_SCORE} " * (row["score"] == SKILL_SCORE)
         rows.append({
             "environment": row["environment"].removeprefix("eitbench/"),
-            "better": b if row["high"] < 0 else a if row["low"] > 0 else MISSING,
+            "better": "B" if row["high"] < 0 else "A" if row["low"] > 0 else MISSING,
             "episodes": Cell(str(row["episodes"])),
-            **{f"{scores()[score].heading} of {name}": Cell(kind + format_number(row[key]))
-               for key, name in (("a", a), ("b", b))},
-            f"advantage of {a}":
-                Cell(format_interval(row["advantage"], row["low"], row["high"])),
-            f"{a} better": Cell(share)})
+            **{f"{scores()[score].heading} of {key.upper()}": Cell(kind + format_number(row[key]))
+               for key in "ab"},
+            "advantage of A": Cell(format_interval(row["advantage"], row["low"], row["high"])),
+            "A better": Cell(share)})
     return Table.of(rows, label="Comparison", keep=list(rows[0]))
 
 
-def format_comparison(table: pd.DataFrame, a: str, b: str, score: str, width: int) -> str:
-    """Return the comparison in lines of ``width`` characters, where the methods are A and B."""
-    whole = comparison_table(table, "A", "B", score)
+def format_comparison(table: pd.DataFrame, a: dict[str, Any], b: dict[str, Any], score: str,
+                      width: int) -> str:
+    """Return the comparison of the methods of two records in lines of ``width`` characters. Names
+    have versions if they are the same."""
+    whole = comparison_table(table, score)
     first = ("environment", "better", "advantage of A", "A better", *whole.headings[3:5])
     fitted = whole.fit_width(width, first)
-    return "\n\n".join([f"A: {a}\nB: {b}", fitted.markdown(),
+    names = [each["method"] + f"@{each['version']}" * (a["method"] == b["method"])
+             for each in (a, b)]
+    return "\n\n".join([f"A: {names[0]}\nB: {names[1]}", fitted.markdown(),
                         *filter(None, [whole.omitted_columns(fitted)])])

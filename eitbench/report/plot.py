@@ -50,10 +50,7 @@ def field(task: Task, c: Any, ax: Axes | None = None, *, currents: Any = None,
     Axes
         In cm. All fields of one task have one colour scale. In 3D the slice along the axis.
 
-    Raises
-    ------
-    ValueError
-        If ``c`` or ``currents`` has another shape, or is not finite.
+    ``ValueError`` if ``c`` or ``currents`` has another shape, or is not finite.
     """
     values = _check.array("c", getattr(c, "mean", c) if isinstance(c, tuple) else c,
                           (task.mesh.n_nodes,), units="mol/m³")
@@ -86,10 +83,7 @@ def episode(method: Any, env: str | gym.Env, seed: int | str, *,
     (times, 2) array of Axes
         Titles have the time and ẽ_c of the estimate.
 
-    Raises
-    ------
-    ValueError
-        If an argument is wrong, or the method does not suit the environment.
+    ``ValueError`` if an argument is wrong, or the method does not suit the environment.
     """
     import matplotlib.pyplot as plt
     asked = resolve_environment(env, world=world)
@@ -133,10 +127,7 @@ def compare(table: pd.DataFrame | Iterable[pd.DataFrame], ax: Axes | None = None
     score : str
         A column of the tables.
 
-    Raises
-    ------
-    ValueError
-        If the table or the column is missing, or no method has the score.
+    ``ValueError`` if the table or the column is missing, or no method has the score.
     """
     tables = [table] if isinstance(table, pd.DataFrame) else list(table)
     if not tables or not all(isinstance(each, pd.DataFrame) for each in tables):

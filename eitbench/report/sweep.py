@@ -11,8 +11,7 @@ from eitbench.bench.table import Table, mean_cell, number_cell
 from eitbench.bench.variants import flatten, format_setting
 from eitbench.report import charts
 from eitbench.report.boards import base_environment, episode_scores
-
-MAX_METHOD_CHARS = 30
+from eitbench.report.tables import MAX_LABEL_CHARS
 
 
 class Sweep(NamedTuple):
@@ -29,7 +28,7 @@ class Sweep(NamedTuple):
     def table(self, *, intervals: bool = True) -> Table:
         """Return a row for each method and a column for each value."""
         names = list(map(format_setting, self.values))
-        return Table.of(({"method": charts.truncate(method, MAX_METHOD_CHARS), **{
+        return Table.of(({"method": charts.truncate(method, MAX_LABEL_CHARS), **{
             name: mean_cell(own) if intervals else number_cell(_mean(own))
             for name, own in zip(names, each, strict=True)}}
             for method, each in self.errors.items()), keep=names, label=self.title)

@@ -120,10 +120,11 @@ def render_site(site: Site) -> dict[str, bytes]:
         files[f"methods/{name}.html"] = method_page(site, name)
     if families:
         files[ROBUSTNESS_PAGE] = site.page("robustness", families=families,
-                                      explanations=robustness.ROBUSTNESS_COLUMNS)
+                                           definition=robustness.shift_definition,
+                                           explanations=robustness.ROBUSTNESS_COLUMNS)
     if site.measured.records:
         files[MEASURED_PAGE] = site.page("measured", measured=site.measured,
-                                    explanations=measured.MEASURED_COLUMNS)
+                                         explanations=measured.MEASURED_COLUMNS)
     return files | {name: (PACKAGE / "report" / name).read_bytes()
                     for name in ("style.css", "script.js")}
 
@@ -167,11 +168,17 @@ def write_site(folder: Path, files: Mapping[str, bytes]) -> None:
 
 def index_page(site: Site) -> bytes:
     """Return the HTML of ``index.html``."""
-    apart = reference_environments()
+    apart, names = reference_environments(), aggregate_environments()
     shown = {board.anchor: tables.page_table(board, "", compact=True) for board in site.boards
              if board.environment not in apart}
+    filters, policies = site.board("filter", ALL), site.board("injection", AGENT_ENVIRONMENT)
+    best = [[row for row in tables.group_by_agent(board) if row.is_ranked] if board else []
+            for board in (filters, policies)]
     return site.page(
-        "index", site=site, headline=headline(site), **key_figures(site),
+        "index", site=site, headline=headline(site), filters=filters, policies=policies,
+        best_filters=best[0], best_policies=best[1],
+        n_filter_environments=sum(board.category == "filter" and board.environment in names
+                                  for board in site.boards),
         moving=site.address(HEADLINE[0]), still=site.address(HEADLINE[1]),
         tables=shown, score_axes=tables.score_axes, about=CATEGORY_TEXTS,
         robustness=ROBUSTNESS_PAGE if robustness.shift_families(site.boards) else "",
@@ -192,21 +199,6 @@ def headline(site: Site) -> dict[str, Any] | None:
     multiple = MULTIPLES.get(int(stationary / filtered))
     return {"multiple": multiple, "homogeneous": homogeneous, "stationary": stationary,
             "filtered": filtered, "board": board} if multiple else None
-
-
-def key_figures(site: Site) -> dict[str, Any]:
-    """Return the aggregate of filters with its best row, and the number of its environments, and
-    the leaderboard of agents with its best agent and its best rule; missing ones are None."""
-    def best(board: Leaderboard | None, *, trained: bool | None = None) -> MethodRow | None:
-        return next((row for row in (tables.group_by_agent(board) if board else ())
-                     if row.is_ranked and trained in (None, bool(row.trainings))), None)
-
-    filters, policies = site.board("filter", ALL), site.board("injection", AGENT_ENVIRONMENT)
-    names = aggregate_environments()
-    return {"filters": filters, "best_filter": best(filters), "policies": policies,
-            "best_agent": best(policies, trained=True), "best_rule": best(policies, trained=False),
-            "n_filter_environments": sum(board.category == "filter" and board.environment in names
-                                         for board in site.boards)}
 
 
 # -- environments ----------------------------------------------------------------------------------

@@ -51,13 +51,6 @@ class ShiftFamily(NamedTuple):
     """Heading -> board, of those with records, in the order of registration."""
 
     @property
-    def definitions(self) -> dict[str, Markup]:
-        """Heading -> the first paragraph of the description of a shift."""
-        ids = {name: board.records[0]["environment"]["id"] for name, board in self.shifts.items()}
-        return {name: markdown(entry(id).description.strip().split("\n\n")[0])
-                for name, id in ids.items()}
-
-    @property
     def table(self) -> Table:
         """Table by decreasing lowest skill score, unfinished methods last."""
         nominal = {row.label: row for row in self.nominal.rows} if self.nominal else {}
@@ -102,6 +95,12 @@ def shift_heading(id: str, home: str) -> str:
     """``eitbench/Pipe2DShortSlugs-v0`` -> ``short slugs``."""
     words = base_environment(id).removeprefix(base_environment(home)) or base_environment(id)
     return re.sub(r"(?<=[a-z])(?=[A-Z])", " ", words).lower()
+
+
+def shift_definition(board: Leaderboard) -> Markup:
+    """Return the first paragraph of the description of a shifted environment."""
+    description = entry(board.records[0]["environment"]["id"]).description
+    return markdown(description.strip().split("\n\n")[0])
 
 
 def _best_naive_error(board: Leaderboard) -> float:
