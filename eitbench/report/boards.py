@@ -264,12 +264,11 @@ def leaderboards(records: list[dict[str, Any]]) -> list[Leaderboard]:
         raise ValueError("leaderboards are made of test seeds; "
                          f"{record_file_name(other)} has {other['split']} seeds")
     current, _ = split_outdated(records)
-    known = anchors(current)
+    made = _boards(current, anchors(current), ranked=True)
     found: list[Leaderboard] = []
     for name in tracks.CATEGORIES:
-        members = [record for record in current if record_category(record) == name]
-        made = _boards(members, current, known, ranked=True)
-        found += [*made, *_aggregate(name, made)]
+        own = [board for board in made if board.category == name]
+        found += [*own, *_aggregate(name, own)]
     return found
 
 
@@ -278,22 +277,20 @@ def run_leaderboards(records: list[dict[str, Any]], known: Anchors | None = None
     """Return the boards of a user's own results, one for each environment and split, without ranks,
     from all episodes of records of any splits and versions. ``known`` are the errors that define
     normalised scores 0 and 1; default: from these records."""
-    known = anchors(records) if known is None else known
-    return _boards(records, records, known, ranked=False)
+    return _boards(records, anchors(records) if known is None else known, ranked=False)
 
 
-def _boards(records: Iterable[dict[str, Any]], timed: list[dict[str, Any]], known: Anchors, *,
-            ranked: bool) -> list[Leaderboard]:
-    """Return a board for each split and environment, in the order of registration; ``timed`` are
-    the records whose machines are compared."""
-    products = _matmul_seconds(timed)
+def _boards(records: list[dict[str, Any]], known: Anchors, *, ranked: bool) -> list[Leaderboard]:
+    """Return a board for each split and environment, in the order of registration."""
+    products = _matmul_seconds(records)
     kinds = [base_environment(id) for id in tracks.ids()]
     groups: dict[tuple[Any, ...], list[dict[str, Any]]] = {}
     for record in records:
         kind = base_environment(record["environment"]["id"])
         place = kinds.index(kind) if kind in kinds else len(kinds)
-        groups.setdefault((SPLIT_ORDER.index(record["split"]), place, world_key(record),
-                           record["environment"]["name"]), []).append(record)
+        key = (SPLIT_ORDER.index(record["split"]), place, world_key(record),
+               record["environment"]["name"], record_category(record))
+        groups.setdefault(key, []).append(record)
     return [_board(groups[key], known, products, ranked=ranked) for key in sorted(groups)]
 
 
