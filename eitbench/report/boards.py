@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Collection, Iterable, Mapping
+from itertools import chain
 from pathlib import Path
 from statistics import median
 from typing import Any, NamedTuple
@@ -164,6 +165,19 @@ class Leaderboard(NamedTuple):
         """Seeds of all rows together."""
         seeds = {seed for record in self.records for seed in record["seeds"]}
         return seed_ranges(sorted(seeds)) if seeds else ""
+
+    def grouped(self) -> list[MethodRow]:
+        """Return the rows, training seeds of an agent grouped.
+
+        Agents with at least two ranked training seeds become one row: the mean over these seeds,
+        with the interval over the episodes of the seeds' mean scores.
+        """
+        groups: dict[str, list[MethodRow]] = {}
+        for row in self.rows:
+            groups.setdefault(row.label if row.has_no_rank else row.agent, []).append(row)
+        grouped = ([_agent_mean(self, rows)] if sum(row.is_ranked for row in rows) > 1 else rows
+                   for rows in groups.values())
+        return sorted(chain(*grouped), key=MethodRow.place)
 
     @property
     def address(self) -> str:
@@ -340,9 +354,29 @@ def _row(whole: dict[str, Any], seeds: set[str], zero: dict[str, float], known: 
         values = list(scores_by_seed(record, name).values())
         reduce: Any = min if name == "seconds_per_step" else np.mean
         cells[name] = float(reduce(values)) if values else None
-    cells |= error_and_skill(errors, zero) | _costs(record, products) | {
+    cells |= _error_and_skill(errors, zero) | _costs(record, products) | {
         "seeds": seed_ranges(record["seeds"]), "skill": _normalised_score(record, known)}
     return MethodRow(cells, record, skill_scores(zero, errors))
+
+
+def _agent_mean(board: Leaderboard, rows: list[MethodRow]) -> MethodRow:
+    """Return the mean of the trainings of an agent."""
+    ranked = [row for row in rows if row.is_ranked]
+    first, unfinished = ranked[0].cells, len(rows) - len(ranked)
+    cells = dict(first)
+    for name in (*INTERVAL_HEADINGS, *headings()):
+        values = [row.cells[name] for row in ranked if row.cells[name] is not None]
+        cells[name] = float(np.mean(values)) if values else None
+    if errors := mean_by_seed([episode_scores(row.record) for row in ranked]):
+        cells |= _error_and_skill(errors, episode_scores(naive_baseline_record(board.records)))
+    else:
+        cells |= {"gain_low": None, "gain_high": None}
+    versions = {row.cells["version"] for row in ranked}
+    return ranked[0]._replace(record=None, trainings=tuple(rows), cells=cells | {
+        "method": agent_name(first["method"]),
+        "note": f"{unfinished} of {len(rows)} unfinished" if unfinished else "",
+        "title": re.sub(r" trained with seed \d+$", "", first["title"]),
+        "version": first["version"] if len(versions) == 1 else ""})
 
 
 def restrict(record: dict[str, Any], seeds: Collection[str]) -> dict[str, Any]:
@@ -381,7 +415,7 @@ def skill_scores(zero: dict[str, float], errors: dict[str, float]) -> dict[str, 
     return {seed: 1.0 - error / zero[seed] for seed, error in errors.items() if zero.get(seed)}
 
 
-def error_and_skill(errors: dict[str, float], zero: dict[str, float]) -> dict[str, float | None]:
+def _error_and_skill(errors: dict[str, float], zero: dict[str, float]) -> dict[str, float | None]:
     """Return mean error and interquartile mean skill score of one environment, with intervals."""
     return (_with_interval("error", {"": errors}, mean_over_environments)
             | _with_interval("gain", {"": skill_scores(zero, errors)}, interquartile_mean))

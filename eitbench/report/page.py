@@ -87,8 +87,7 @@ def write_page(store: EpisodeStore, boards: Sequence[Leaderboard],
     runs = [run for board in boards for record in board.records for run in record["runs"]]
     html = render_template(
         "page.html.j2", root="", sections=list(zip(boards, shown, strict=True)), sweeps=sweeps,
-        explanations=tables.explanations(shown), run_title=tables.run_title,
-        score_axes=tables.score_axes, curve_chart=tables.curve_chart, seed_ranges=seed_ranges,
+        tables=tables, explanations=tables.explanations(shown), seed_ranges=seed_ranges,
         snapshots_of=partial(_snapshots, store), failures=partial(failures, store),
         colour_bar=_draw_bare(3.0, 0.12, lambda axes: axes.imshow(
             np.linspace(0, 1, 256)[None], cmap=FIELD_COLORMAP, aspect="auto")),

@@ -4,15 +4,13 @@ seed are one row of a page."""
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Iterable, Sequence
-from itertools import chain, islice
+from itertools import islice
 from urllib.parse import quote
 
 import numpy as np
 
 from eitbench._sanitize import escape_markdown
-from eitbench.bench.statistics import agent_name, mean_by_seed
 from eitbench.bench.table import MISSING, Cell, Table, mean_cell, number_cell
 from eitbench.bench.text import format_interval, format_number
 from eitbench.report import charts
@@ -24,7 +22,6 @@ from eitbench.report.boards import (
     column_descriptions,
     columns,
     episode_scores,
-    error_and_skill,
     headings,
     naive_baseline_record,
 )
@@ -39,43 +36,6 @@ COLUMN_PRIORITY = ("method", "ẽ_c", "withheld RMSE", "normalised score", "seed
 MAX_LABEL_CHARS = 30
 BADGES = {"floor": "naive baseline", "reference": "oracle"}
 """Role in a record -> badge."""
-
-
-# -- trainings -------------------------------------------------------------------------------------
-
-
-def group_by_agent(board: Leaderboard) -> list[MethodRow]:
-    """Return the rows of a leaderboard in its order, training seeds of an agent grouped.
-
-    Agents with at least two ranked training seeds become one row: the mean over these seeds, with
-    the interval over the episodes of the seeds' mean scores.
-    """
-    groups: dict[str, list[MethodRow]] = {}
-    for row in board.rows:
-        groups.setdefault(row.label if row.has_no_rank else row.agent, []).append(row)
-    grouped = ([_agent_mean(board, rows)] if sum(row.is_ranked for row in rows) > 1 else rows
-               for rows in groups.values())
-    return sorted(chain(*grouped), key=MethodRow.place)
-
-
-def _agent_mean(board: Leaderboard, rows: list[MethodRow]) -> MethodRow:
-    """Return the mean of the trainings of an agent."""
-    ranked = [row for row in rows if row.is_ranked]
-    first, unfinished = ranked[0].cells, len(rows) - len(ranked)
-    cells = dict(first)
-    for name in (*INTERVAL_HEADINGS, *headings()):
-        values = [row.cells[name] for row in ranked if row.cells[name] is not None]
-        cells[name] = float(np.mean(values)) if values else None
-    if errors := mean_by_seed([episode_scores(row.record) for row in ranked]):
-        cells |= error_and_skill(errors, episode_scores(naive_baseline_record(board.records)))
-    else:
-        cells |= {"gain_low": None, "gain_high": None}
-    versions = {row.cells["version"] for row in ranked}
-    return ranked[0]._replace(record=None, trainings=tuple(rows), cells=cells | {
-        "method": agent_name(first["method"]),
-        "note": f"{unfinished} of {len(rows)} unfinished" if unfinished else "",
-        "title": re.sub(r" trained with seed \d+$", "", first["title"]),
-        "version": first["version"] if len(versions) == 1 else ""})
 
 
 # -- cells -----------------------------------------------------------------------------------------
@@ -156,7 +116,7 @@ def filter_flags(row: MethodRow) -> str:
 
 def page_table(board: Leaderboard, root: str, *, compact: bool = False) -> Table:
     """Return a board for a page; ``root`` leads from the page to the site's folder."""
-    axes, together = score_axes(board), group_by_agent(board)
+    axes, together = score_axes(board), board.grouped()
 
     def cells(row: MethodRow) -> dict[str, Cell]:
         badges = _outperformed(row, together) + author_badges(row)
@@ -291,7 +251,7 @@ def cost_chart(board: Leaderboard) -> charts.Chart | None:
     None without data."""
     points = [charts.ParetoPoint(row.cells["title"], row.colour, row.cells["seconds_per_step"],
                            row.cells["error"], row.is_ranked)
-              for row in group_by_agent(board)
+              for row in board.grouped()
               if row.cells["error"] is not None and row.cells["seconds_per_step"]]
     if not points:
         return None

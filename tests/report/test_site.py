@@ -25,7 +25,7 @@ from eitbench.report.site import (
     write_site,
 )
 from eitbench.report.site.robustness import shift_families, shift_heading
-from eitbench.report.tables import BADGES, group_by_agent, markdown_table, page_table
+from eitbench.report.tables import BADGES, markdown_table, page_table
 from eitbench.report.templates import N_COLOURS, markdown
 from pages import Page, text_of
 
@@ -214,7 +214,7 @@ def board_of(records):
 def test_the_line_of_an_agent_is_the_mean_of_its_trainings():
     """An agent has error, skill score, interval over episodes, and one rank; Markdown has each training seed."""
     board = board_of(agents(record("ppo_seed3", [*of(0.5)[:5], None])))
-    placed = group_by_agent(board)
+    placed = board.grouped()
     assert [row.cells["method"] for row in placed] == ["ppo", "between", "seer", "behind", "homogeneous"]
     row, parts = placed[0], placed[0].trainings
     assert [part.cells["method"] for part in parts] == ["ppo_seed2", "ppo_seed0", "ppo_seed1", "ppo_seed3"]
@@ -241,7 +241,7 @@ def test_the_line_of_an_agent_is_the_mean_of_its_trainings():
 def test_grouped_trainings(records, expected):
     """Records of one agent by the same submitter form a group if two have a rank."""
     board = board_of([record("homogeneous", list(LEVEL), **FLOOR), *records])
-    assert sorted(row.cells["method"] for row in group_by_agent(board)) == sorted([*expected, "homogeneous"])
+    assert sorted(row.cells["method"] for row in board.grouped()) == sorted([*expected, "homogeneous"])
 
 
 def test_an_outperformed_reference_is_marked():

@@ -97,7 +97,8 @@ class Site(NamedTuple):
     def page(self, kind: str, root: str = "", /, **contents: Any) -> bytes:
         """Render a template of the site for a page from which ``root`` leads to the site."""
         links = {words: self.address(name, root) for words, name in LINKS.items()}
-        return render_template(f"site/{kind}.html.j2", root=root, links=links, **contents)
+        return render_template(f"site/{kind}.html.j2", root=root, links=links, site=self,
+                               tables=tables, **contents)
 
 
 def collect(records: Iterable[dict[str, Any]], folder: Path | None = None) -> Site:
@@ -172,15 +173,15 @@ def index_page(site: Site) -> bytes:
     shown = {board.anchor: tables.page_table(board, "", compact=True) for board in site.boards
              if board.environment not in apart}
     filters, policies = site.board("filter", ALL), site.board("injection", AGENT_ENVIRONMENT)
-    best = [[row for row in tables.group_by_agent(board) if row.is_ranked] if board else []
+    best = [[row for row in board.grouped() if row.is_ranked] if board else []
             for board in (filters, policies)]
     return site.page(
-        "index", site=site, headline=headline(site), filters=filters, policies=policies,
+        "index", headline=headline(site), filters=filters, policies=policies,
         best_filters=best[0], best_policies=best[1],
         n_filter_environments=sum(board.category == "filter" and board.environment in names
                                   for board in site.boards),
         moving=site.address(HEADLINE[0]), still=site.address(HEADLINE[1]),
-        tables=shown, score_axes=tables.score_axes, about=CATEGORY_TEXTS,
+        shown=shown, about=CATEGORY_TEXTS,
         robustness=ROBUSTNESS_PAGE if robustness.shift_families(site.boards) else "",
         measured=MEASURED_PAGE if site.measured.records else "",
         last=max(map(finished_at, site.records), default="")[:10],
@@ -207,21 +208,15 @@ def headline(site: Site) -> dict[str, Any] | None:
 def environment_page(site: Site, board: Leaderboard) -> bytes:
     """Return the HTML of the page of an environment."""
     id = board.records[0]["environment"]["id"]
-    table = tables.page_table(board, "../")
     description, details = documentation(id)
     animation = f"media/{board.environment}.webp"
     moving = site.address(animation, "../")
     size = (site.folder / animation).stat().st_size if site.folder and moving else 0
+    is_shifted = nominal_id(id) and environment_name(id, {}) == board.environment
     return site.page(
         "environment", "../", board=board, id=id, description=description, details=details,
-        table=table, axes=tables.score_axes(board),
-        explanations=tables.explanations([table]),
-        front=tables.cost_chart(board), curves=tables.curve_chart(board),
         moving=moving, media_mb=f"{1e-6 * size:.1f} MB",
-        robustness=(ROBUSTNESS_PAGE
-                    if nominal_id(id) and environment_name(id, {}) == board.environment else ""),
-        siblings=[other for other in site.classes[board.category]
-                  if other is not board and not other.is_aggregate])
+        robustness=ROBUSTNESS_PAGE if is_shifted else "")
 
 
 def documentation(id: str) -> tuple[Markup, Markup]:
@@ -248,7 +243,7 @@ def method_page(site: Site, name: str) -> bytes:
     # agents of several environments have no common title
     title = name if len({env for _, env in versions}) > 1 else records[0]["title"]
     return site.page(
-        "method", "../", site=site, name=name, title=title, placements=table, axes=axes,
+        "method", "../", name=name, title=title, placements=table, axes=axes,
         versions=[(own, *_source(own[0])) for own in versions.values()],
         addresses={(row.cells["environment"], row.cells["version"]): board.address
                    for board, row in placements},
