@@ -52,7 +52,6 @@ CATEGORY_TEXTS = {
 }
 """Class -> task."""
 HEADLINE_ENVIRONMENT, AGENT_ENVIRONMENT = "eitbench-Pipe2D-v0", "eitbench-Pipe2DInjectionBudget-v0"
-HEADLINE_METHODS = ("homogeneous", "gauss_newton", "extended_kalman_filter")
 MULTIPLES = dict(enumerate(("two", "three", "four", "five", "six", "seven", "eight", "nine", "ten",
                             "eleven", "twelve"), 2))
 ROBUSTNESS_PAGE, MEASURED_PAGE = "robustness.html", "measured.html"
@@ -189,17 +188,15 @@ def index_page(site: Site) -> bytes:
 
 
 def headline(site: Site) -> dict[str, Any] | None:
-    """Return the errors ẽ_c of images with and without a flow model, their ratio in words and the
-    leaderboard; None without official records."""
+    """Return the errors ẽ_c of methods, the ratio of images without and with a flow model in words,
+    and the leaderboard; None without official records."""
     board = site.board("filter", HEADLINE_ENVIRONMENT)
     errors = {row.cells["method"]: row.cells["error"] for row in (board.rows if board else ())
               if row.cells["official"] and row.complete}
-    if board is None or not set(HEADLINE_METHODS) <= errors.keys():
+    if not {"homogeneous", "gauss_newton", "extended_kalman_filter"} <= errors.keys():
         return None
-    homogeneous, stationary, filtered = (errors[name] for name in HEADLINE_METHODS)
-    multiple = MULTIPLES.get(int(stationary / filtered))
-    return {"multiple": multiple, "homogeneous": homogeneous, "stationary": stationary,
-            "filtered": filtered, "board": board} if multiple else None
+    multiple = MULTIPLES.get(int(errors["gauss_newton"] / errors["extended_kalman_filter"]))
+    return {"multiple": multiple, "errors": errors, "board": board} if multiple else None
 
 
 # -- environments ----------------------------------------------------------------------------------
