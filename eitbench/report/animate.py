@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -42,8 +42,10 @@ def animate(environment: str, methods: Sequence[str], seed: str, step: int | Non
         first, last = env.world.warm_up + 1, env.world.n_steps
         if step is not None:
             first = last = _check.integer("step", step, low=begin, high=last)
-        draw = _env_frames if len(loaded) == 1 else _compared_frames
-        images = list(draw(env, loaded, number, range(first, last + 1, every)))
+        at = range(first, last + 1, every)
+        images = _compared_frames(env, loaded, number, at) if len(loaded) > 1 else [
+            np.asarray(env.render()) for t, *_ in run_until(env, loaded[0], number, at[-1])
+            if t in at]
     path.parent.mkdir(parents=True, exist_ok=True)
     frames = list(map(Image.fromarray, images))
     options: dict[str, Any] = {}
@@ -60,19 +62,14 @@ def animate(environment: str, methods: Sequence[str], seed: str, step: int | Non
     return path
 
 
-def _env_frames(env: Any, loaded: list[Method], seed: int, at: range) -> Iterator[np.ndarray]:
-    """Yield the environment's images of one method at these t."""
-    for t, *_ in run_until(env, loaded[0], seed, at[-1]):
-        if t in at:
-            yield np.asarray(env.render())
-
-
-def _compared_frames(env: Any, loaded: list[Method], seed: int, at: range) -> Iterator[np.ndarray]:
-    """Yield images of the truth and several estimates at these t."""
+def _compared_frames(env: Any, loaded: list[Method], seed: int, at: range) -> list[np.ndarray]:
+    """Return images of the truth and several estimates at these t."""
     shown = [(method.title, states_at(env, method, seed, at)) for method in loaded]
+    images = []
     for t in at:
         truth, _, currents = shown[0][1][t]
         fields = [("Truth", truth_mesh(env.world), truth)]
         fields += [(title, env.task.mesh, states[t][1]) for title, states in shown]
         time = t * env.task.transport.time_step
-        yield draw_frame(env.task, fields, currents, time)
+        images.append(draw_frame(env.task, fields, currents, time))
+    return images
