@@ -7,6 +7,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib import colormaps
+from matplotlib.colors import to_rgb
 from PIL import Image
 from threadpoolctl import threadpool_limits
 
@@ -15,7 +17,7 @@ from eitbench.bench.methods import Method
 from eitbench.bench.run import isolated_job
 from eitbench.bench.tracks import Environment
 from eitbench.data.episode_cache import truth_mesh
-from eitbench.envs.rendering import draw_frame
+from eitbench.envs.rendering import FIELD_COLORMAP, IDLE, SINK, SOURCE, STD_COLORMAP, draw_frame
 from eitbench.report.plot import parse_single_seed, run_until, states_at
 
 
@@ -49,9 +51,8 @@ def animate(environment: str, methods: Sequence[str], seed: str, step: int | Non
     path.parent.mkdir(parents=True, exist_ok=True)
     frames = list(map(Image.fromarray, images))
     options: dict[str, Any] = {}
-    if path.suffix == ".gif":                       # one palette, or the file has twice the size
-        some = Image.fromarray(np.concatenate(images[::max(len(images) // 8, 1)]))
-        palette = some.quantize(method=Image.Quantize.FASTOCTREE)
+    if path.suffix == ".gif":
+        palette = _palette()
         frames = [frame.quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames]
     elif path.suffix == ".webp":
         options = {"quality": 30, "method": 6}  # a fifth of the GIF, and letters are still sharp
@@ -73,3 +74,14 @@ def _compared_frames(env: Any, loaded: list[Method], seed: int, at: range) -> li
         time = t * env.task.transport.time_step
         images.append(draw_frame(env.task, fields, currents, time))
     return images
+
+
+def _palette() -> Image.Image:
+    """Return the 256 colours shared by all frames: colour maps, greys, electrodes."""
+    maps = [colormaps[name](np.linspace(0, 1, 110))[:, :3]
+            for name in (FIELD_COLORMAP, STD_COLORMAP)]
+    greys = np.linspace(0, 1, 33)[:, None].repeat(3, axis=1)
+    table = np.concatenate([*maps, greys, [to_rgb(colour) for colour in (SOURCE, SINK, IDLE)]])
+    image = Image.new("P", (1, 1))
+    image.putpalette((255 * table).round().astype(np.uint8).tobytes())
+    return image
