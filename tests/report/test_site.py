@@ -15,7 +15,6 @@ from eitbench.bench.tracks import ids
 from eitbench.report.site import (
     HEADLINE,
     LINKS,
-    ROBUSTNESS_PAGE,
     collect,
     documentation,
     headline,
@@ -289,12 +288,12 @@ def test_robustness_by_hand():
 
 def test_robustness_is_on_the_site_and_in_the_text(pages, rendered):
     files, text = rendered(shifted()), render(collect(shifted()))["leaderboard.md"]
-    assert f'href="{ROBUSTNESS_PAGE}"' in files["index.html"] and ROBUSTNESS_PAGE not in pages
+    assert 'href="robustness.html"' in files["index.html"] and "robustness.html" not in pages
     for id in (SHORT, NOISE):
         name = id.replace("/", "-")
-        assert f'href="environments/{name}.html"' in files[ROBUSTNESS_PAGE]
-        assert f'href="../{ROBUSTNESS_PAGE}"' in files[f"environments/{name}.html"]
-    assert "Slugs pass in half the time" in files[ROBUSTNESS_PAGE]
+        assert f'href="environments/{name}.html"' in files["robustness.html"]
+        assert 'href="../robustness.html"' in files[f"environments/{name}.html"]
+    assert "Slugs pass in half the time" in files["robustness.html"]
     assert "0.3 × 15 (worse than naive)" in text[text.index("## robustness"):]
 
 

@@ -54,7 +54,6 @@ CATEGORY_TEXTS = {
 HEADLINE_ENVIRONMENT, AGENT_ENVIRONMENT = "eitbench-Pipe2D-v0", "eitbench-Pipe2DInjectionBudget-v0"
 MULTIPLES = dict(enumerate(("two", "three", "four", "five", "six", "seven", "eight", "nine", "ten",
                             "eleven", "twelve"), 2))
-ROBUSTNESS_PAGE, MEASURED_PAGE = "robustness.html", "measured.html"
 HEADLINE = "media/headline.webp", "media/headline.png"
 """Animation of the first page, and its still picture, from the leaderboards' folder."""
 LINKS = {"Submit a method": "README.md", "Statistics": "../docs/statistics.md",
@@ -88,6 +87,11 @@ class Site(NamedTuple):
         return next((board for board in self.boards
                      if (board.category, board.environment) == (category, environment)), None)
 
+    @property
+    def families(self) -> list[robustness.ShiftFamily]:
+        """Nominal environments with their shifted ones."""
+        return robustness.shift_families(self.boards)
+
     def address(self, name: str, root: str = "") -> str:
         """Return the address of a file, given by its path from the leaderboards' folder, from a
         page from which ``root`` leads to the site; empty if the file is missing."""
@@ -97,7 +101,7 @@ class Site(NamedTuple):
         """Render a template of the site for a page from which ``root`` leads to the site."""
         links = {words: self.address(name, root) for words, name in LINKS.items()}
         return render_template(f"site/{kind}.html.j2", root=root, links=links, site=self,
-                               tables=tables, **contents)
+                               tables=tables, robustness=robustness, **contents)
 
 
 def collect(records: Iterable[dict[str, Any]], folder: Path | None = None) -> Site:
@@ -111,20 +115,16 @@ def collect(records: Iterable[dict[str, Any]], folder: Path | None = None) -> Si
 
 def render_site(site: Site) -> dict[str, bytes]:
     """Return all files of the site, by their path within it."""
-    families = robustness.shift_families(site.boards)
     files = {"index.html": index_page(site)}
     for board in site.boards:
         if not board.is_aggregate:
             files[f"environments/{board.environment}.html"] = environment_page(site, board)
     for name in dict.fromkeys(record["method"] for record in site.records):
         files[f"methods/{name}.html"] = method_page(site, name)
-    if families:
-        files[ROBUSTNESS_PAGE] = site.page("robustness", families=families,
-                                           definition=robustness.shift_definition,
-                                           explanations=robustness.ROBUSTNESS_COLUMNS)
+    if site.families:
+        files["robustness.html"] = site.page("robustness")
     if site.measured.records:
-        files[MEASURED_PAGE] = site.page("measured", measured=site.measured,
-                                         explanations=measured.MEASURED_COLUMNS)
+        files["measured.html"] = site.page("measured", explanations=measured.MEASURED_COLUMNS)
     return files | {name: (PACKAGE / "report" / name).read_bytes()
                     for name in ("style.css", "script.js")}
 
@@ -134,10 +134,8 @@ def render(site: Site) -> dict[str, str]:
     `eitbench.bench.load`, and of ``leaderboard.md``, by file name; records of measurement files are
     in the second only."""
     text = render_template(
-        "site/leaderboard.md.j2", families=robustness.shift_families(site.boards),
-        robustness_columns=robustness.ROBUSTNESS_COLUMNS, measured=site.measured,
+        "site/leaderboard.md.j2", site=site, tables=tables, robustness=robustness,
         measured_columns=measured.MEASURED_COLUMNS, columns=column_descriptions(measured=False),
-        classes=site.classes, markdown_table=tables.markdown_table,
         superseded=list(map(record_file_name, split_outdated(site.records)[1])))
     table = leaderboard_table(site.boards).replace({"environment": {
         record["environment"]["name"]: qualified_name(record["environment"])
@@ -181,8 +179,6 @@ def index_page(site: Site) -> bytes:
                                   for board in site.boards),
         moving=site.address(HEADLINE[0]), still=site.address(HEADLINE[1]),
         shown=shown, about=CATEGORY_TEXTS,
-        robustness=ROBUSTNESS_PAGE if robustness.shift_families(site.boards) else "",
-        measured=MEASURED_PAGE if site.measured.records else "",
         last=max(map(finished_at, site.records), default="")[:10],
         explanations=tables.explanations(shown.values()))
 
@@ -213,7 +209,7 @@ def environment_page(site: Site, board: Leaderboard) -> bytes:
     return site.page(
         "environment", "../", board=board, id=id, description=description, details=details,
         moving=moving, media_mb=f"{1e-6 * size:.1f} MB",
-        robustness=ROBUSTNESS_PAGE if is_shifted else "")
+        is_shifted=is_shifted)
 
 
 def documentation(id: str) -> tuple[Markup, Markup]:
