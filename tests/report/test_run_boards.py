@@ -89,7 +89,7 @@ def test_skill_is_measured_on_shared_episodes(board):
 
 def test_skill_needs_its_anchors():
     """The normalised score is 0 for the homogeneous estimate in smoothing, 1 for the smoother with the true model.
-    Without one of these, or with those of another world, it is missing."""
+    Without one of these, or with anchors of another world, it is missing."""
     assert [row(ANCHORS, each["method"], "smoothing")["skill"] for each in ANCHORS] == [0.0, 1.0]
     mine = made("mine", "filter", FLOOR)
     elsewhere = made("mine", "filter", FLOOR, kwargs={"world": {"schedule": {"scored_steps": 16}}})
