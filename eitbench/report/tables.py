@@ -83,10 +83,8 @@ def _number_cells(row: MethodRow, names: Iterable[str]) -> dict[str, Cell]:
 
 def _rank_cell(row: MethodRow, rows: list[MethodRow]) -> Cell:
     rank = row.cells["rank"]
-    if rank is None:
-        return Cell(MISSING)
-    is_tied = sum(other.cells["rank"] == rank for other in rows) > 1
-    return Cell(f"{rank}", float(rank), note="tied" if is_tied else "")
+    is_tied = row.is_ranked and sum(other.cells["rank"] == rank for other in rows) > 1
+    return number_cell(rank)._replace(note="tied" if is_tied else "")
 
 
 def method_cell(row: MethodRow, root: str, more: Iterable[str] = ()) -> Cell:

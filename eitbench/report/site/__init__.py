@@ -22,7 +22,7 @@ from eitbench._sanitize import escape_csv
 from eitbench.bench.methods import baseline_folder, builtin_files, builtin_sha256, version_of
 from eitbench.bench.records import finished_at, group_runs, record_file_name, split_outdated
 from eitbench.bench.scores import scores
-from eitbench.bench.table import MISSING, Cell, Table, number_cell
+from eitbench.bench.table import Cell, Table, number_cell
 from eitbench.bench.text import scores_by_seed
 from eitbench.bench.tracks import environment_name, nominal_id, qualified_name
 from eitbench.envs.env_docs import describe_environment
@@ -250,13 +250,13 @@ def _placements(placements: list[tuple[Leaderboard, MethodRow]]) -> tuple[Table,
     gains = tables.score_axes(every)["skill score"]
     rows = []
     for board, row in placements:
-        rank = row.cells["rank"]
+        n_ranked = sum(each.is_ranked for each in board.rows)
         link = f"../index.html#{board.anchor}" if board.is_aggregate else f"../{board.address}"
         rows.append({
             "leaderboard": Cell(board.title, board.title.casefold(), link=link,
                           note=f"{board.category} · {row.cells['version']}", badges=row.badges),
-            "rank": Cell(MISSING) if rank is None else Cell(
-                str(rank), float(rank), note=f"of {sum(each.is_ranked for each in board.rows)}"),
+            "rank": number_cell(row.cells["rank"])._replace(
+                note=f"of {n_ranked}" if row.is_ranked else ""),
             "ẽ_c": tables.interval_cell(row, "error", tables.score_axes(board)["ẽ_c"]),
             "skill score": tables.interval_cell(row, "gain", gains),
             "ms/step": number_cell(row.cells["seconds_per_step"])})
