@@ -53,11 +53,6 @@ def site(rendered):
     return rendered(several_boards())
 
 
-@pytest.fixture(scope="module")
-def pages(site):
-    return {path: content for path, content in site.items() if path.endswith(".html")}
-
-
 # -- up to date, reproducible -----------------------------------------------------------------------------------------
 
 
@@ -105,11 +100,11 @@ def rows_of(html, anchor):
             for row in re.findall(r"<tr.*?>(.*?)</tr>", body)]
 
 
-def test_numbers_are_those_of_the_boards(pages):
+def test_numbers_are_those_of_the_boards(site):
     """Index and environment pages have ranks, errors, skill scores and times of all rows of all leaderboards."""
     for board in collect(several_boards()).boards:
-        shown = rows_of(pages["index.html"], f'id="{board.anchor}"')
-        places = [shown] if board.is_aggregate else [shown, rows_of(pages[board.address], "<h2>Leaderboard</h2>")]
+        shown = rows_of(site["index.html"], f'id="{board.anchor}"')
+        places = [shown] if board.is_aggregate else [shown, rows_of(site[board.address], "<h2>Leaderboard</h2>")]
         for cells_of_rows in places:
             assert len(cells_of_rows) == len(board.rows)
             for cells, row in zip(cells_of_rows, board.rows, strict=True):
@@ -122,7 +117,7 @@ def test_numbers_are_those_of_the_boards(pages):
                     if row.cells[name] is not None:
                         assert format_interval(*row.interval(name)) in " ".join(cells)
                 assert board.is_aggregate or format_number(row.cells["seconds_per_step"]) in cells
-    ranks = [cells[0] for cells in rows_of(pages["environments/eitbench-Pipe2D-v0.html"], "<h2>Leaderboard</h2>")]
+    ranks = [cells[0] for cells in rows_of(site["environments/eitbench-Pipe2D-v0.html"], "<h2>Leaderboard</h2>")]
     assert [rank for rank in ranks if rank.startswith("1")] == ["1 tied", "1 tied"]
 
 
@@ -135,17 +130,17 @@ def test_reference_environments_have_their_tables_on_their_pages_only(rendered):
     assert 'id="board-injection-eitbench-Pipe2DInjection-v0"' not in pages["index.html"]
 
 
-def test_a_methods_page_has_every_episode_and_its_provenance(pages, rendered):
+def test_a_methods_page_has_every_episode_and_its_provenance(site, rendered):
     """A method's page has recorded seeds, errors, failures, parameters, commands, and each machine once."""
-    html = pages["methods/failing.html"]
+    html = site["methods/failing.html"]
     assert all(f">test:{i}</td>" in html for i in range(8)) and "RuntimeError: oh" in html and "1 failed" in html
     for episode in next(r for r in several_boards() if r["method"] == "failing")["episodes"][:7]:
         assert f">{format_number(episode['scores']['error'])}</td>" in html
-    text = text_of(pages["methods/b.html"])
+    text = text_of(site["methods/b.html"])
     for expected in ("window = 3", "numpy 2.4.6", "An abacus", "c0ffee", "eitbench run",
                      "eitbench verify leaderboards/results/eitbench-Pipe2D-v0--b--"):
         assert expected in text, expected
-    assert pages["methods/a.html"].count("<h2>Version") == 2
+    assert site["methods/a.html"].count("<h2>Version") == 2
     runs = [RUN | {"machine": RUN["machine"] | {"matmul_seconds": seconds}} for seconds in (0.06, 0.05, 0.055)]
     text = text_of(rendered([record("a", [0.1], runs=runs)])["methods/a.html"])
     assert text.count("An abacus") == 1 and "matrix product 50 to 60 ms" in text
@@ -286,9 +281,9 @@ def test_robustness_by_hand():
     assert shift_heading("me/WeakWorn-v0", "me/Weak-v0") == "worn" and shift_heading(SHORT, HOME) == "short slugs"
 
 
-def test_robustness_is_on_the_site_and_in_the_text(pages, rendered):
+def test_robustness_is_on_the_site_and_in_the_text(site, rendered):
     files, text = rendered(shifted()), render(collect(shifted()))["leaderboard.md"]
-    assert 'href="robustness.html"' in files["index.html"] and "robustness.html" not in pages
+    assert 'href="robustness.html"' in files["index.html"] and "robustness.html" not in site
     for id in (SHORT, NOISE):
         name = id.replace("/", "-")
         assert f'href="environments/{name}.html"' in files["robustness.html"]
