@@ -15,7 +15,6 @@ import shutil
 import subprocess
 import sys
 import time
-import tomllib
 from pathlib import Path
 
 import generated
@@ -124,15 +123,6 @@ def write(name: str, content: str | bytes) -> None:
     path.write_bytes(content.encode() if isinstance(content, str) else content)
 
 
-def toml(value: object) -> str:
-    """Return strings, lists and dicts of strings as TOML, whose strings have the form of JSON."""
-    if isinstance(value, dict):
-        return "{" + ", ".join(f"{toml(key)} = {toml(of)}" for key, of in value.items()) + "}"
-    if isinstance(value, list):
-        return "[" + ", ".join(map(toml, value)) + "]"
-    return json.dumps(value, ensure_ascii=False)
-
-
 def main() -> None:
     """Stage, build, check."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -179,11 +169,13 @@ def stage_generated(*, execute: bool) -> list[str]:
 
 
 def configure(pages: list[str]) -> None:
-    """Write the site's configuration, with the generated pages in its navigation."""
+    """Write the site's configuration, with the generated pages in place of each "folder/*"."""
+    def listed(match: re.Match[str]) -> str:
+        return ", ".join(json.dumps(page) for page in pages
+                         if page.startswith(match[1]) and page.endswith(".md"))
+
     config = (ROOT / "docs" / "zensical.toml").read_text(encoding="utf-8")
-    nav = toml(expanded(tomllib.loads(config)["project"]["nav"], pages))
-    config = re.sub(r"^nav = \[.*?^\]$", lambda _: f"nav = {nav}", config,
-                    flags=re.DOTALL | re.MULTILINE)
+    config = re.sub(r'"(\w+/)\*"', listed, config)
     (BUILD / "zensical.toml").write_text(config, encoding="utf-8")
 
 
@@ -201,21 +193,6 @@ def check_readme() -> None:
                for words in (said[1], out.getvalue())]
     if any(abs(a - b) > 1.1e-4 for a, b in zip(*numbers, strict=True)):
         raise SystemExit(f"README.md has {said[1]}, but its snippet prints {out.getvalue()}")
-
-
-def expanded(nav: list[object], pages: list[str]) -> list[object]:
-    """Return the navigation with the generated pages in place of each "folder/*"."""
-    entries: list[object] = []
-    for entry in nav:
-        if isinstance(entry, dict):
-            entries.append({title: expanded(inner, pages) if isinstance(inner, list) else inner
-                            for title, inner in entry.items()})
-        elif str(entry).endswith("/*"):
-            entries += [page for page in pages
-                        if page.startswith(str(entry)[:-1]) and page.endswith(".md")]
-        else:
-            entries.append(entry)
-    return entries
 
 
 if __name__ == "__main__":

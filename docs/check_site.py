@@ -1,4 +1,4 @@
-"""Does every link of a built site lead somewhere, and does it load nothing from elsewhere?"""
+"""Check that every link of a built site leads somewhere, and that no page loads from elsewhere."""
 
 from html.parser import HTMLParser
 from pathlib import Path
@@ -26,8 +26,8 @@ class Page(HTMLParser):
 
 
 def problems(site: Path) -> list[str]:
-    """A line for each link, anchor or picture of the pages below ``site`` that is not there, and
-    for each thing that a page loads from another machine."""
+    """Return a line for each link, anchor or picture of the pages below ``site`` that is missing,
+    and for each file that a page loads from another machine."""
     pages = {path: Page(path) for path in sorted(site.rglob("*.html"))}
     found = []
     for path, page in pages.items():

@@ -22,8 +22,7 @@ PLACES = {
     "bench/test_checkpoints.py": "study",      # runs every trained agent
     "bench/test_verify.py": "study",           # reruns valid and falsified records
     "test_docs.py::test_documentation_builds": "study",
-    "report/test_boards.py::test_published_files_are_rendered_from_the_records": "study",
-    "report/test_site.py::test_the_published_site_is_rendered_from_the_records": "study",
+    "report/test_site.py::test_published_files_are_rendered_from_the_records": "study",
     "report/test_site_browser.py": "browser",
 }
 """Slow tests by folder, file or test: `pytest -m "not browser and not study"` omits these two groups."""

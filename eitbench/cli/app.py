@@ -204,9 +204,8 @@ def compare(
         ours, theirs = ([record for record in comparison.find_records(name, records)
                          if not env or record["environment"]["id"] in env] for name in (a, b))
         table = comparison.compare(ours, theirs, score, comparison.naive_baseline_records(records))
-    names = comparison.display_names(ours[0], theirs[0])
     width = options.table_width()
-    options.echo(comparison.format_comparison(table, *names, score, width))
+    options.echo(comparison.format_comparison(table, ours[0], theirs[0], score, width))
 
 
 @app.command()

@@ -105,8 +105,7 @@ def print_report(out: Path, asked: Sequence[Job] = (), worlds: Sequence[dict[str
     from eitbench._files import write_atomically
     from eitbench.bench.store import EpisodeStore
     from eitbench.report.boards import anchors, bundled_anchors, run_leaderboards
-    from eitbench.report.failures import select_requested
-    from eitbench.report.page import write_page
+    from eitbench.report.page import select_requested, write_page
     from eitbench.report.policies import gap_text, policy_rows
     from eitbench.report.sweep import sweeps, swept_parameter
     from eitbench.report.tables import markdown, terminal_tables
@@ -140,7 +139,7 @@ def command_line() -> str:
 def _say_failures(store: EpisodeStore, records: list[dict[str, Any]],
                   asked: Sequence[Job]) -> None:
     """Print the failures, and how to debug the first."""
-    from eitbench.report.failures import failures
+    from eitbench.report.page import failures
     found = failures(store, records)
     for failure in found:
         options.echo(failure, err=True)

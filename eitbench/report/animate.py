@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,16 +13,12 @@ from PIL import Image
 from threadpoolctl import threadpool_limits
 
 from eitbench import _check
-from eitbench.bench.isolation import choose_isolation
 from eitbench.bench.methods import Method
-from eitbench.bench.run import Job
-from eitbench.bench.tracks import Environment, subtrack_of
+from eitbench.bench.run import isolated_job
+from eitbench.bench.tracks import Environment
 from eitbench.data.episode_cache import truth_mesh
-from eitbench.envs import rendering
+from eitbench.envs.rendering import FIELD_COLORMAP, IDLE, SINK, SOURCE, STD_COLORMAP, draw_frame
 from eitbench.report.plot import parse_single_seed, run_until, states_at
-
-ANIMATION_SUFFIXES = (".gif", ".webp")
-"""Suffixes of animations."""
 
 
 def animate(environment: str, methods: Sequence[str], seed: str, step: int | None, path: Path, *,
@@ -33,7 +29,7 @@ def animate(environment: str, methods: Sequence[str], seed: str, step: int | Non
     ``ValueError`` if a method is not compatible with the environment, several are policies, or
     the path's suffix is not .gif or .webp (.png with ``step``).
     """
-    suffixes = ANIMATION_SUFFIXES if step is None else (".png",)
+    suffixes = (".gif", ".webp") if step is None else (".png",)
     if path.suffix not in suffixes:
         how = "without" if step is None else "with"
         raise ValueError(f"out must end in {' or '.join(suffixes)} {how} step, got {path.name}")
@@ -42,22 +38,18 @@ def animate(environment: str, methods: Sequence[str], seed: str, step: int | Non
     if asked.track == "injection" and len(methods) > 1:
         raise ValueError(f"policy must be one for {environment}, got {', '.join(methods)}")
     with threadpool_limits(1):
-        kinds = [choose_isolation(asked, method, isolate) for method in methods]
-        loaded = [Job(asked, method, number, kind).load()
-                  for method, kind in zip(methods, kinds, strict=True)]
+        loaded = [isolated_job(asked, method, isolate).load() for method in methods]
         env: Any = asked.make(render_mode="rgb_array")
-        for each in loaded:
-            if subtrack_of(env) not in each.subtracks:
-                raise ValueError(f"baseline {each.name} plays {', '.join(each.subtracks)}, but "
-                                 f"{environment} is a {subtrack_of(env)} environment")
         begin = env.core.n_initial + 1 if asked.track == "injection" else 1
         first, last = env.world.warm_up + 1, env.world.n_steps
         if step is not None:
             first = last = _check.integer("step", step, low=begin, high=last)
-        draw = _env_frames if len(loaded) == 1 else _compared_frames
-        frames = [Image.fromarray(frame)
-                  for frame in draw(env, loaded, number, range(first, last + 1, every))]
+        at = range(first, last + 1, every)
+        images = _compared_frames(env, loaded, number, at) if len(loaded) > 1 else [
+            np.asarray(env.render()) for t, *_ in run_until(env, loaded[0], number, at[-1])
+            if t in at]
     path.parent.mkdir(parents=True, exist_ok=True)
+    frames = list(map(Image.fromarray, images))
     options: dict[str, Any] = {}
     if path.suffix == ".gif":
         palette = _palette()
@@ -71,32 +63,25 @@ def animate(environment: str, methods: Sequence[str], seed: str, step: int | Non
     return path
 
 
-def _env_frames(env: Any, loaded: list[Method], seed: int, at: range) -> Iterator[np.ndarray]:
-    """Yield the environment's images of one method at these t."""
-    for t, *_ in run_until(env, loaded[0], seed, at[-1]):
-        if t in at:
-            yield np.asarray(env.render())
-
-
-def _compared_frames(env: Any, loaded: list[Method], seed: int, at: range) -> Iterator[np.ndarray]:
-    """Yield images of the truth and several estimates at these t."""
+def _compared_frames(env: Any, loaded: list[Method], seed: int, at: range) -> list[np.ndarray]:
+    """Return images of the truth and several estimates at these t."""
     shown = [(method.title, states_at(env, method, seed, at)) for method in loaded]
+    images = []
     for t in at:
         truth, _, currents = shown[0][1][t]
         fields = [("Truth", truth_mesh(env.world), truth)]
         fields += [(title, env.task.mesh, states[t][1]) for title, states in shown]
         time = t * env.task.transport.time_step
-        yield rendering.draw_frame(env.task, fields, currents, time)
+        images.append(draw_frame(env.task, fields, currents, time))
+    return images
 
 
 def _palette() -> Image.Image:
     """Return the 256 colours shared by all frames: colour maps, greys, electrodes."""
-    colours = [colormaps[name](np.linspace(0, 1, n))[:, :3]
-               for name, n in ((rendering.FIELD_COLORMAP, 120), (rendering.STD_COLORMAP, 100))]
-    greys = np.linspace(0, 1, 27)[:, None].repeat(3, axis=1)
-    pairs = [to_rgb(colour) for colour in (rendering.SOURCE, rendering.SINK, rendering.IDLE)]
-    halves = [tuple(0.5 + 0.5 * c for c in colour) for colour in pairs]  # at the edges of the bars
-    table = np.concatenate([*colours, greys, pairs, halves, halves])[:256]
+    maps = [colormaps[name](np.linspace(0, 1, 110))[:, :3]
+            for name in (FIELD_COLORMAP, STD_COLORMAP)]
+    greys = np.linspace(0, 1, 33)[:, None].repeat(3, axis=1)
+    table = np.concatenate([*maps, greys, [to_rgb(colour) for colour in (SOURCE, SINK, IDLE)]])
     image = Image.new("P", (1, 1))
     image.putpalette((255 * table).round().astype(np.uint8).tobytes())
     return image

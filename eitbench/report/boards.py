@@ -7,7 +7,8 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
+from itertools import chain
 from pathlib import Path
 from statistics import median
 from typing import Any, NamedTuple
@@ -29,6 +30,7 @@ from eitbench.bench.records import (
 from eitbench.bench.scores import scores
 from eitbench.bench.statistics import (
     Scores,
+    Statistic,
     agent_name,
     interquartile_mean,
     mean_by_seed,
@@ -44,9 +46,9 @@ from eitbench.worlds.registry import entries
 ALL = "all"
 """Name of the environment in the rows of an aggregate."""
 IDENTITY_FIELDS = ("class", "environment", "method", "version", "title", "rank", "note", "official",
-            "seeds")
-INTERVAL_SCORES = ("error", "gain")
-"""Numbers with an interval."""
+                   "seeds")
+INTERVAL_HEADINGS = {"error": "ẽ_c", "gain": "skill score"}
+"""Score with an interval -> heading."""
 SKILL_ANCHORS = ("homogeneous", "true_model_smoother")
 """Methods with normalised scores 0 and 1."""
 Anchors = Mapping[tuple[str, str, str], Mapping[str, float]]
@@ -83,7 +85,7 @@ class MethodRow(NamedTuple):
     """One method on a board."""
 
     cells: dict[str, Any]
-    """Values of `csv_fields`; None if missing."""
+    """Column of `leaderboard_table` -> value; None if missing."""
     record: dict[str, Any] | None = None
     """Restricted to the board's episodes; None in an aggregate."""
     skill_scores: dict[str, float] = {}  # noqa: RUF012 (never changed)
@@ -135,10 +137,10 @@ class MethodRow(NamedTuple):
         return not self.complete, value, self.label
 
     def interval(self, name: str) -> tuple[float, float, float]:
-        """Return a score and the ends of its interval; NaN and infinite where unknown."""
-        value, low, high = (self.cells[f"{name}{end}"] for end in ("", "_low", "_high"))
-        return (math.nan if value is None else value, -math.inf if low is None else low,
-                math.inf if high is None else high)
+        """Return a score and the ends of its interval; NaN where unknown."""
+        ends = [self.cells[f"{name}{end}"] for end in ("", "_low", "_high")]
+        value, low, high = np.array(ends, dtype=float).tolist()
+        return value, low, high
 
 
 class Leaderboard(NamedTuple):
@@ -163,6 +165,19 @@ class Leaderboard(NamedTuple):
         """Seeds of all rows together."""
         seeds = {seed for record in self.records for seed in record["seeds"]}
         return seed_ranges(sorted(seeds)) if seeds else ""
+
+    def grouped(self) -> list[MethodRow]:
+        """Return the rows, training seeds of an agent grouped.
+
+        Agents with at least two ranked training seeds become one row: the mean over these seeds,
+        with the interval over the episodes of the seeds' mean scores.
+        """
+        groups: dict[str, list[MethodRow]] = {}
+        for row in self.rows:
+            groups.setdefault(row.label if row.has_no_rank else row.agent, []).append(row)
+        grouped = ([_agent_mean(self, rows)] if sum(row.is_ranked for row in rows) > 1 else rows
+                   for rows in groups.values())
+        return sorted(chain(*grouped), key=MethodRow.place)
 
     @property
     def address(self) -> str:
@@ -189,28 +204,25 @@ def columns(*, measured: bool = True) -> dict[str, tuple[str, str]]:
     return first | each | COST_COLUMNS
 
 
-def headings(*, measured: bool = False) -> dict[str, str]:
+def headings() -> dict[str, str]:
     """Return column -> heading of all numbers without an interval."""
-    return {name: heading for name, (heading, _) in columns(measured=measured).items()
-            if name not in INTERVAL_SCORES}
+    return {name: heading for name, (heading, _) in columns().items()
+            if name not in INTERVAL_HEADINGS}
 
 
-def column_descriptions(*, measured: bool = False) -> dict[str, str]:
+def column_descriptions(*, measured: bool = True) -> dict[str, str]:
     """Return heading -> explanation."""
     return {"rank": _RANK, **dict(columns(measured=measured).values())}
 
 
-def csv_fields() -> list[str]:
-    """Return the columns of leaderboard.csv."""
-    ends = [f"{name}{end}" for name in INTERVAL_SCORES for end in ("", "_low", "_high")]
-    return [*IDENTITY_FIELDS, *ends, *headings()]
-
-
 def leaderboard_table(found: Iterable[Leaderboard]) -> pd.DataFrame:
-    """Return one row for each row of the boards, with the columns of `csv_fields`."""
-    rows = [row.cells for board in found for row in board.rows]
-    types: dict[str, Any] = dict.fromkeys(csv_fields()[len(IDENTITY_FIELDS):], float)
-    return pd.DataFrame(rows, columns=csv_fields()).astype(types | {"rank": "Int64"})
+    """Return one row for each row of the boards, with the columns of leaderboard.csv."""
+    numbers = [f"{name}{end}" for name in INTERVAL_HEADINGS for end in ("", "_low", "_high")]
+    numbers += [name for name in columns(measured=False) if name not in INTERVAL_HEADINGS]
+    rows = pd.DataFrame([row.cells for board in found for row in board.rows],
+                        columns=[*IDENTITY_FIELDS, *numbers])
+    types: dict[str, Any] = dict.fromkeys(numbers, float)
+    return rows.astype(types | {"rank": "Int64"})
 
 
 # -- environments ----------------------------------------------------------------------------------
@@ -262,17 +274,15 @@ def leaderboards(records: list[dict[str, Any]]) -> list[Leaderboard]:
     finished every episode of all `aggregate_environments` with a naive baseline (an official one
     where it exists), if there are several. ``seconds_per_step`` is of the fastest episode.
     """
-    for record in records:
-        if record["split"] != "test":
-            raise ValueError("leaderboards are made of test seeds; "
-                             f"{record_file_name(record)} has {record['split']} seeds")
+    if other := next((record for record in records if record["split"] != "test"), None):
+        raise ValueError("leaderboards are made of test seeds; "
+                         f"{record_file_name(other)} has {other['split']} seeds")
     current, _ = split_outdated(records)
-    known = anchors(current)
+    made = _boards(current, anchors(current), ranked=True)
     found: list[Leaderboard] = []
     for name in tracks.CATEGORIES:
-        members = [record for record in current if record_category(record) == name]
-        made = _boards(members, current, known, ranked=True)
-        found += [*made, *_aggregate(name, _aggregate_boards(made))]
+        own = [board for board in made if board.category == name]
+        found += [*own, *_aggregate(name, own)]
     return found
 
 
@@ -281,22 +291,20 @@ def run_leaderboards(records: list[dict[str, Any]], known: Anchors | None = None
     """Return the boards of a user's own results, one for each environment and split, without ranks,
     from all episodes of records of any splits and versions. ``known`` are the errors that define
     normalised scores 0 and 1; default: from these records."""
-    known = anchors(records) if known is None else known
-    return _boards(records, records, known, ranked=False)
+    return _boards(records, anchors(records) if known is None else known, ranked=False)
 
 
-def _boards(records: Iterable[dict[str, Any]], timed: list[dict[str, Any]], known: Anchors, *,
-            ranked: bool) -> list[Leaderboard]:
-    """Return a board for each split and environment, in the order of registration; ``timed`` are
-    the records whose machines are compared."""
-    products = _matmul_seconds(timed)
+def _boards(records: list[dict[str, Any]], known: Anchors, *, ranked: bool) -> list[Leaderboard]:
+    """Return a board for each split and environment, in the order of registration."""
+    products = _matmul_seconds(records)
     kinds = [base_environment(id) for id in tracks.ids()]
     groups: dict[tuple[Any, ...], list[dict[str, Any]]] = {}
     for record in records:
         kind = base_environment(record["environment"]["id"])
         place = kinds.index(kind) if kind in kinds else len(kinds)
-        groups.setdefault((SPLIT_ORDER.index(record["split"]), place, world_key(record),
-                           record["environment"]["name"]), []).append(record)
+        key = (SPLIT_ORDER.index(record["split"]), place, world_key(record),
+               record["environment"]["name"], record_category(record))
+        groups.setdefault(key, []).append(record)
     return [_board(groups[key], known, products, ranked=ranked) for key in sorted(groups)]
 
 
@@ -307,10 +315,10 @@ def _board(records: list[dict[str, Any]], known: Anchors, products: dict[str, fl
     floor = naive_baseline_record(records)
     shown = [floor] if floor and ranked else records
     seeds = {seed for record in shown for seed in record["seeds"]}
-    zero = episode_errors(floor)
+    zero = episode_scores(floor)
     rows = sorted((_row(record, seeds, zero, known, products) for record in records
                    if not seeds.isdisjoint(record["seeds"])), key=MethodRow.place)
-    scores = {row.label: {environment: episode_errors(row.record)} for row in rows
+    scores = {row.label: {environment: episode_scores(row.record)} for row in rows
               if ranked and not row.cells["note"]}
     return Leaderboard(record_category(records[0]), environment, environment_title(records[0]),
                        _with_ranks(rows, scores))
@@ -335,23 +343,47 @@ def _with_ranks(rows: list[MethodRow], scores: Mapping[str, Scores], **options: 
 def _row(whole: dict[str, Any], seeds: set[str], zero: dict[str, float], known: Anchors,
          products: dict[str, float]) -> MethodRow:
     """Return the row of a record on the board with these seeds, without its rank."""
-    record = whole | {
-        "episodes": [episode for episode in whole["episodes"] if episode["seed"] in seeds],
-        "seeds": [seed for seed in whole["seeds"] if seed in seeds]}
-    errors = episode_errors(record)
-    counts = {"failed": sum(episode["status"] != "ok" for episode in whole["episodes"]),
-              "missing": len(seeds - set(record["seeds"]))}
-    note = [*filter(None, [record["role"]]), *["privileged"] * record["privileged"],
-            *(f"{count} {what}" for what, count in counts.items() if count)]
-    cells = _identity_cells(record, record["environment"]["name"], ", ".join(note))
-    cells |= error_and_skill(errors, zero)
-    cells |= {"seeds": seed_ranges(record["seeds"]), "skill": _normalised_score(record, known)}
+    record = restrict(whole, seeds)
+    errors = episode_scores(record)
+    failed = sum(episode["status"] != "ok" for episode in whole["episodes"])
+    missing = len(seeds - set(record["seeds"]))
+    note = [record["role"], "privileged" * record["privileged"], f"{failed} failed" * bool(failed),
+            f"{missing} missing" * bool(missing)]
+    cells = _identity_cells(record, record["environment"]["name"], ", ".join(filter(None, note)))
     for name in (scores() | scores("measured")).keys() - {"error"}:
         values = list(scores_by_seed(record, name).values())
         reduce: Any = min if name == "seconds_per_step" else np.mean
         cells[name] = float(reduce(values)) if values else None
-    cells |= _costs(record, products)
+    cells |= _error_and_skill(errors, zero) | _costs(record, products) | {
+        "seeds": seed_ranges(record["seeds"]), "skill": _normalised_score(record, known)}
     return MethodRow(cells, record, skill_scores(zero, errors))
+
+
+def _agent_mean(board: Leaderboard, rows: list[MethodRow]) -> MethodRow:
+    """Return the mean of the trainings of an agent."""
+    ranked = [row for row in rows if row.is_ranked]
+    first, unfinished = ranked[0].cells, len(rows) - len(ranked)
+    cells = dict(first)
+    for name in (*INTERVAL_HEADINGS, *headings()):
+        values = [row.cells[name] for row in ranked if row.cells[name] is not None]
+        cells[name] = float(np.mean(values)) if values else None
+    if errors := mean_by_seed([episode_scores(row.record) for row in ranked]):
+        cells |= _error_and_skill(errors, episode_scores(naive_baseline_record(board.records)))
+    else:
+        cells |= {"gain_low": None, "gain_high": None}
+    versions = {row.cells["version"] for row in ranked}
+    return ranked[0]._replace(record=None, trainings=tuple(rows), cells=cells | {
+        "method": agent_name(first["method"]),
+        "note": f"{unfinished} of {len(rows)} unfinished" if unfinished else "",
+        "title": re.sub(r" trained with seed \d+$", "", first["title"]),
+        "version": first["version"] if len(versions) == 1 else ""})
+
+
+def restrict(record: dict[str, Any], seeds: Collection[str]) -> dict[str, Any]:
+    """Return a record with only the episodes that have one of these seeds."""
+    return record | {
+        "episodes": [episode for episode in record["episodes"] if episode["seed"] in seeds],
+        "seeds": [seed for seed in record["seeds"] if seed in seeds]}
 
 
 def _identity_cells(record: dict[str, Any], environment: str, note: str) -> dict[str, Any]:
@@ -373,9 +405,9 @@ def is_naive_baseline(record: dict[str, Any]) -> bool:
             and version_number(record["version"]) is not None)
 
 
-def episode_errors(record: dict[str, Any] | None) -> dict[str, float]:
-    """Return seed -> ẽ_c of a record; nothing without one."""
-    return scores_by_seed(record, "error") if record else {}
+def episode_scores(record: dict[str, Any] | None, name: str = "error") -> dict[str, float]:
+    """Return seed -> score of a record, ẽ_c by default; nothing without a record."""
+    return scores_by_seed(record, name) if record else {}
 
 
 def skill_scores(zero: dict[str, float], errors: dict[str, float]) -> dict[str, float]:
@@ -383,22 +415,22 @@ def skill_scores(zero: dict[str, float], errors: dict[str, float]) -> dict[str, 
     return {seed: 1.0 - error / zero[seed] for seed, error in errors.items() if zero.get(seed)}
 
 
-def error_and_skill(errors: dict[str, float], zero: dict[str, float]) -> dict[str, float | None]:
+def _error_and_skill(errors: dict[str, float], zero: dict[str, float]) -> dict[str, float | None]:
     """Return mean error and interquartile mean skill score of one environment, with intervals."""
     return (_with_interval("error", {"": errors}, mean_over_environments)
             | _with_interval("gain", {"": skill_scores(zero, errors)}, interquartile_mean))
 
 
 def _with_interval(name: str, values: dict[str, dict[str, float]],
-                   statistic: Any) -> dict[str, float | None]:
+                   statistic: Statistic) -> dict[str, float | None]:
     """Return a statistic of environment -> seed -> score, ``name``, and the ends of its 95 %
     interval, ``name_low`` and ``name_high``; None where unknown."""
-    keys = (name, f"{name}_low", f"{name}_high")
-    if not all(values.values()):
-        return dict.fromkeys(keys)
-    three = stratified_bootstrap({key: list(own.values()) for key, own in values.items()},
-                                 statistic)
-    return dict(zip(keys, (each if math.isfinite(each) else None for each in three), strict=True))
+    three: Iterable[float | None] = (None, None, None)
+    if all(values.values()):
+        strata = {key: list(own.values()) for key, own in values.items()}
+        three = (each if math.isfinite(each) else None
+                 for each in stratified_bootstrap(strata, statistic))
+    return dict(zip((name, f"{name}_low", f"{name}_high"), three, strict=True))
 
 
 # -- aggregates ------------------------------------------------------------------------------------
@@ -408,8 +440,8 @@ def aggregate_environments() -> set[str]:
     """Return the names of the environments of aggregates: all registered ids with their default
     arguments, without shifted environments, which have a separate leaderboard, and without
     `reference_environments`."""
-    names = {tracks.environment_name(id, {}) for id in tracks.ids() if not tracks.nominal_id(id)}
-    return names - reference_environments()
+    return {tracks.environment_name(each.id, {}) for each in entries().values()
+            if not each.nominal and not each.is_reference}
 
 
 def reference_environments() -> set[str]:
@@ -419,40 +451,37 @@ def reference_environments() -> set[str]:
             if each.is_reference}
 
 
-def _aggregate_boards(made: list[Leaderboard]) -> list[Leaderboard]:
-    """Return the leaderboards of an aggregate: with a naive baseline, an official one where
-    it exists, since a third-party baseline could exclude all other methods."""
-    names = aggregate_environments()
-    own = [board for board in made if board.environment in names
-           and any(row.skill_scores for row in board.rows)]
-    return [board for board in own if any(
-        is_naive_baseline(record) and record["official"] for record in board.records)] or own
-
-
 def _aggregate(category: str, made: list[Leaderboard]) -> list[Leaderboard]:
     """Return the methods that have finished all of several environments, ordered and ranked by the
-    interquartile mean of their skill scores."""
+    interquartile mean of their skill scores.
+
+    The naive baselines are official ones where they exist, since a third-party baseline could
+    exclude all other methods.
+    """
+    names = aggregate_environments()
+    made = [board for board in made if board.environment in names
+            and any(row.skill_scores for row in board.rows)]
+    made = [board for board in made if any(
+        is_naive_baseline(record) and record["official"] for record in board.records)] or made
     if len(made) < 2:
         return []
     found = [{row.label: row for row in board.rows if row.complete and row.skill_scores}
              for board in made]
-    rows = []
-    competing = {}
+    rows, competing = [], {}
     for label in set.intersection(*map(set, found)):
         own = [each[label] for each in found]
         gains = {board.environment: row.skill_scores for board, row in zip(made, own, strict=True)}
         note = ", ".join(dict.fromkeys(word for row in own for word in row.badges))
         assert own[0].record is not None
         rows.append(MethodRow(
-            dict.fromkeys(csv_fields()) | _identity_cells(own[0].record, ALL, note)
+            dict.fromkeys(own[0].cells) | _identity_cells(own[0].record, ALL, note)
             | _with_interval("gain", gains, interquartile_mean)
             | {"official": all(row.cells["official"] for row in own)}))
         if not note:
             competing[label] = gains
-    rows.sort(key=MethodRow.place)
-    board = Leaderboard(category, ALL, "All environments", _with_ranks(
-        rows, competing, statistic=interquartile_mean, higher_is_better=True))
-    return [board] if rows else []
+    ranked = _with_ranks(sorted(rows, key=MethodRow.place), competing,
+                         statistic=interquartile_mean, higher_is_better=True)
+    return [Leaderboard(category, ALL, "All environments", ranked)] if rows else []
 
 
 # -- records ---------------------------------------------------------------------------------------
@@ -462,10 +491,9 @@ def read_leaderboard_records(folder: Path) -> tuple[list[dict[str, Any]], list[s
     """Return the records of a folder, and one message for each record that leaderboards leave out,
     since it is invalid or has other seeds than test. ``ValueError`` if no other record exists."""
     read, complaints = read_valid_files(folder)
-    others = [f"record {path} has {record['split']} seeds, and leaderboards are made of test seeds"
-              for path, record in read.items() if record["split"] != "test"]
-    complaints += others
-    if len(others) == len(read):
+    complaints += [f"record {path} has {record['split']} seeds, and leaderboards are made of test "
+                   "seeds" for path, record in read.items() if record["split"] != "test"]
+    if all(record["split"] != "test" for record in read.values()):
         raise ValueError("; ".join([f"records must be a folder with records of test seeds, got "
                                     f"{folder}, which holds no valid record of test seeds",
                                     *complaints]))
@@ -516,9 +544,9 @@ def _matmul_seconds(records: Iterable[dict[str, Any]]) -> dict[str, float]:
     where there are any, since a single one depends on the load."""
     timed: dict[str, dict[bool, list[float]]] = {}
     for record in records:
-        for run in record["runs"]:
-            by = timed.setdefault(run["machine"]["processor"], {True: [], False: []})
-            by[record["official"]].append(run["machine"]["matmul_seconds"])
+        for machine in (run["machine"] for run in record["runs"]):
+            by = timed.setdefault(machine["processor"], {True: [], False: []})
+            by[record["official"]].append(machine["matmul_seconds"])
     return {processor: median(by[True] or by[False]) for processor, by in timed.items()}
 
 

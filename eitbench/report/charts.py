@@ -14,11 +14,10 @@ from typing import NamedTuple
 import numpy as np
 from markupsafe import Markup
 
-from eitbench.report.templates import N_COLOURS, macro
+from eitbench.report.templates import macro
 
-WIDTH, HEIGHT, LEFT, RIGHT, TOP, BOTTOM = 860, 360, 76, 830, 12, 314
-"""Size of a chart, and the edges of its axes, px."""
-BOX = {"width": WIDTH, "height": HEIGHT, "left": LEFT, "right": RIGHT, "top": TOP, "bottom": BOTTOM}
+WIDTH, LEFT, RIGHT, TOP, BOTTOM = 860, 76, 830, 12, 314
+"""Width of a chart, and the edges of its axes, px."""
 CELL_WIDTH_PX = 96
 """Width of a drawing in a table's cell, px."""
 CHAR_WIDTH = 7.0
@@ -53,8 +52,7 @@ class Chart(NamedTuple):
     """A drawing with its legend."""
 
     svg: Markup
-    legend: list[tuple[int, bool, str]]
-    """Colour, whether dashed, name."""
+    legend: Sequence[Series | ParetoPoint]
     note: str = ""
     """End of the caption."""
 
@@ -113,7 +111,7 @@ def line_chart(x: np.ndarray, series: Sequence[Series], x_label: str, y_label: s
     curves = [(s, [(px(a), py(b)) for a, b in zip(x, s.values, strict=False) if b == b])
               for s in sorted(series, key=lambda s: not s.faint)]
     shown = [s for s in series if not s.faint]
-    return Chart(macro("line_chart")(BOX, px, py, x_label, y_label, curves), _legend(shown),
+    return Chart(macro("line_chart")(px, py, x_label, y_label, curves), shown,
                  " Thin lines: all other methods." if len(shown) < len(series) else "")
 
 
@@ -136,9 +134,9 @@ def pareto_chart(points: Sequence[ParetoPoint], x_label: str, y_label: str) -> C
         name = truncate(p.name, MAX_POINT_LABEL_CHARS)
         place = _free_position(px(p.x), py(p.y), CHAR_WIDTH * len(name), taken)
         marks.append((p, p in best, name, place))
-    svg = macro("pareto_chart")(BOX, px, py, x_label, y_label, marks,
+    svg = macro("pareto_chart")(px, py, x_label, y_label, marks,
                                 [(px(p.x), py(p.y)) for p in best])
-    return Chart(svg, _legend(points), f": {', '.join(p.name for p in best)}" if best else "")
+    return Chart(svg, points, f": {', '.join(p.name for p in best)}" if best else "")
 
 
 def pareto_front(points: Iterable[ParetoPoint]) -> list[ParetoPoint]:
@@ -148,10 +146,6 @@ def pareto_front(points: Iterable[ParetoPoint]) -> list[ParetoPoint]:
         if not best or p.y < best[-1].y:
             best.append(p)
     return best
-
-
-def _legend(series: Iterable[Series | ParetoPoint]) -> list[tuple[int, bool, str]]:
-    return [(s.colour % N_COLOURS, s.colour >= N_COLOURS, s.name) for s in series]
 
 
 def sparkline(three: tuple[float, float, float], px: Axis, each: Iterable[float] = ()) -> Markup:

@@ -11,12 +11,7 @@ import pandas as pd
 
 from eitbench import _check
 from eitbench._files import bundled_path, resolve_input
-from eitbench.bench.records import (
-    finished_at,
-    read_record,
-    read_records,
-    split_outdated,
-)
+from eitbench.bench.records import finished_at, read_record, read_records, split_outdated
 from eitbench.bench.scores import scores
 from eitbench.bench.statistics import (
     Statistic,
@@ -46,12 +41,8 @@ def find_records(name: str, folder: Path) -> list[dict[str, Any]]:
     """Return the record in the file NAME.json, or the records METHOD or METHOD@VERSION of the
     first of these that has any: a folder, the package, `OWN_RECORDS`. Without a version the current
     official records are returned, or else the other current ones. The name of an agent without
-    training seed, such as ppo, selects its `mean_over_trainings`.
-
-    Raises
-    ------
-    ValueError
-        If no record matches, or records of several versions match.
+    training seed, such as ppo, selects its `mean_over_trainings`. ``ValueError`` if no record
+    matches, or records of several versions match.
     """
     if name.endswith(".json"):
         return [read_record(resolve_input(Path(name)))]
@@ -60,17 +51,15 @@ def find_records(name: str, folder: Path) -> list[dict[str, Any]]:
     for place in dict.fromkeys(map(Path.resolve, (folder, BUNDLED_RECORDS, OWN_RECORDS))):
         there = read_records(place)
         known |= {record["method"] for record in there}
-        if not version:
-            there = split_outdated(there)[0]
-        own = [record for record in there
+        current = there if version else split_outdated(there)[0]
+        own = [record for record in current
                if record["method"] == method and version in ("", record["version"])]
         if not version:
             own = [record for record in own if record["official"]] or own or mean_over_trainings(
-                [record for record in there if agent_name(record["method"]) == method])
-        versions = sorted({record["version"] for record in own})
+                [record for record in current if agent_name(record["method"]) == method])
+        versions = sorted({f"{method}@{record['version']}" for record in own})
         if len(versions) > 1:
-            found = ", ".join(f"{method}@{each}" for each in versions)
-            raise ValueError(f"{name} fits several versions: {found}")
+            raise ValueError(f"{name} fits several versions: {', '.join(versions)}")
         if own:
             return own
     raise ValueError(f"record of {name} not found in {folder}, the package, or {OWN_RECORDS}"
@@ -88,7 +77,7 @@ def mean_over_trainings(records: list[dict[str, Any]]) -> list[dict[str, Any]]:
         found = {name: mean_by_seed([scores_by_seed(each, name) for each in trainings])
                  for name in scores()}
         episodes = [{"seed": seed, "status": "ok", "scores": {
-            name: own[seed] for name, own in found.items() if seed in own}}
+            name: own[seed] / scores()[name].factor for name, own in found.items() if seed in own}}
             for seed in found["error"]]
         means.append(trainings[0] | {
             "method": agent_name(trainings[0]["method"]), "episodes": episodes,
@@ -121,10 +110,7 @@ def compare(a: list[dict[str, Any]], b: list[dict[str, Any]], score: str = "erro
         better_low and better_high of its interval. Over several environments interquartile means
         of skill scores, or means of the environments' means.
 
-    Raises
-    ------
-    ValueError
-        If the score is unknown, or the methods share no finished episode with this score.
+    ``ValueError`` if the score is unknown, or the methods share no finished episode with it.
     """
     known = {each.name: each.direction for each in scores().values()}
     _check.choice("score", score, [name for name in known if known[name] in ("lower", "higher")])
@@ -181,16 +167,9 @@ def _row(label: str, score: str, pairs: dict[str, Pair], statistic: Statistic, *
             **dict(zip(("better", "better_low", "better_high"), better, strict=True))}
 
 
-def display_names(a: dict[str, Any], b: dict[str, Any]) -> tuple[str, str]:
-    """Return the names of two records' methods, with versions if they are the same."""
-    if a["method"] != b["method"]:
-        return a["method"], b["method"]
-    return f"{a['method']}@{a['version']}", f"{b['method']}@{b['version']}"
-
-
-def comparison_table(table: pd.DataFrame, a: str, b: str, score: str = "error") -> Table:
-    """Return the comparison of methods named ``a`` and ``b``; column better has the name of the
-    better one where the 95 % interval of the advantage of a excludes zero."""
+def comparison_table(table: pd.DataFrame, score: str = "error") -> Table:
+    """Return the comparison of the methods A and B; column better has the name of the better one
+    where the 95 % interval of the advantage of A excludes zero."""
     rows = []
     for row in table.to_dict("records"):
         share = f"{100 * row['better']:.0f} %"
@@ -199,20 +178,23 @@ def comparison_table(table: pd.DataFrame, a: str, b: str, score: str = "error") 
         kind = f"{SKILL_SCORE} " * (row["score"] == SKILL_SCORE)
         rows.append({
             "environment": row["environment"].removeprefix("eitbench/"),
-            "better": b if row["high"] < 0 else a if row["low"] > 0 else MISSING,
+            "better": "B" if row["high"] < 0 else "A" if row["low"] > 0 else MISSING,
             "episodes": Cell(str(row["episodes"])),
-            **{f"{scores()[score].heading} of {name}": Cell(kind + format_number(row[key]))
-               for key, name in (("a", a), ("b", b))},
-            f"advantage of {a}":
-                Cell(format_interval(row["advantage"], row["low"], row["high"])),
-            f"{a} better": Cell(share)})
+            **{f"{scores()[score].heading} of {key.upper()}": Cell(kind + format_number(row[key]))
+               for key in "ab"},
+            "advantage of A": Cell(format_interval(row["advantage"], row["low"], row["high"])),
+            "A better": Cell(share)})
     return Table.of(rows, label="Comparison", keep=list(rows[0]))
 
 
-def format_comparison(table: pd.DataFrame, a: str, b: str, score: str, width: int) -> str:
-    """Return the comparison in lines of ``width`` characters, where the methods are A and B."""
-    whole = comparison_table(table, "A", "B", score)
+def format_comparison(table: pd.DataFrame, a: dict[str, Any], b: dict[str, Any], score: str,
+                      width: int) -> str:
+    """Return the comparison of the methods of two records in lines of ``width`` characters. Names
+    have versions if they are the same."""
+    whole = comparison_table(table, score)
     first = ("environment", "better", "advantage of A", "A better", *whole.headings[3:5])
     fitted = whole.fit_width(width, first)
-    return "\n\n".join([f"A: {a}\nB: {b}", fitted.markdown(),
+    names = [each["method"] + f"@{each['version']}" * (a["method"] == b["method"])
+             for each in (a, b)]
+    return "\n\n".join([f"A: {names[0]}\nB: {names[1]}", fitted.markdown(),
                         *filter(None, [whole.omitted_columns(fitted)])])

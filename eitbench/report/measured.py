@@ -10,12 +10,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 from matplotlib.ticker import FuncFormatter
-from PIL import Image
 
 from eitbench._files import write_atomically
 from eitbench.bench.measured import N_PLOTTED_FRAMES
@@ -23,7 +21,7 @@ from eitbench.envs.rendering import draw_electrodes, draw_field
 from eitbench.measured.calibration import electrode_misfits
 from eitbench.measured.quality import percent
 from eitbench.measured.segmentation import ktc_score, require_round_tank, segment
-from eitbench.report.templates import data_uri, render_template
+from eitbench.report.templates import data_uri, figure_image, render_template
 
 if TYPE_CHECKING:
     from eitbench.bench.measured import MeasuredRun
@@ -50,25 +48,27 @@ def write_report(path: Path, env: MeasuredEnv, runs: Sequence[MeasuredRun],
     data-quality warnings, residuals by electrode, and, with a ``truth`` (256, 256) for
     `eitbench.measured.segmentation`, the segmentations."""
     source = dict(env.measurements.source)
+    figures = {"fit": _fit(env), "contacts": _contacts(env), "electrodes": _electrodes(runs[0]),
+               "over_time": _residuals_over_time(env, runs), "velocity": _velocity(env, runs),
+               "segmentation": None if truth is None else _segmentations(env, runs, truth)}
     page = render_template(
         "measured.html.j2", root="", title=str(source.pop("file", "Measurements")), source=source,
         env=env, runs=runs, percent=percent, estimate=_estimate(env, runs[0]),
-        over_time=_over_time(env, runs), velocity=_velocity(env, runs), fit=_figure(_fit(env)),
-        correction=CORRECTION_TEXT[env.calibration.correction], contacts=_figure(_contacts(env)),
-        electrodes=_figure(_electrodes(runs[0])),
-        segmentation="" if truth is None else _figure(_segmentations(env, runs, truth)))
+        correction=CORRECTION_TEXT[env.calibration.correction],
+        **{name: data_uri(figure_image(figure)) if figure else ""
+           for name, figure in figures.items()})
     write_atomically(path, page)
 
 
 def _estimate(env: MeasuredEnv, run: MeasuredRun) -> str:
-    """The last estimate of a target at rest, or an animation, as a data URI."""
+    """Return the last estimate of a target at rest, or an animation, as a data URI."""
     if env.task.is_stationary:
-        return _figure(_picture(env, run, len(run.steps) - 1))
+        return data_uri(figure_image(_picture(env, run, len(run.steps) - 1)))
     after = np.flatnonzero(run.steps > min(env.task.warm_up, env.episode_steps - 1))
     rows = after[np.unique(np.linspace(0, len(after) - 1, N_PLOTTED_FRAMES).round().astype(int))]
-    frames = [_image(_picture(env, run, int(row))) for row in rows]
+    frames = [figure_image(_picture(env, run, int(row))) for row in rows]
     return data_uri(frames[0], "webp", save_all=True, append_images=frames[1:], loop=0,
-                     duration=125, quality=40, method=4)
+                    duration=125, quality=40, method=4)
 
 
 def _picture(env: MeasuredEnv, run: MeasuredRun, row: int) -> Figure:
@@ -117,43 +117,39 @@ def _segmentations(env: MeasuredEnv, runs: Sequence[MeasuredRun], truth: np.ndar
     return figure
 
 
-def _over_time(env: MeasuredEnv, runs: Sequence[MeasuredRun]) -> str:
-    """Withheld residuals and NIS of each method, if there are any, as a data URI; else empty."""
-    residuals = pd.DataFrame({run.method: run.withheld_residual_rms**2 for run in runs})
-    nis = pd.DataFrame({run.method: run.nis for run in runs})
-    residuals, nis = (each.rolling(max(env.task.warm_up, 1), center=True, min_periods=1).mean()
-                      for each in (residuals, nis))
-    shown = [(label, curves) for label, curves in (
-        ("withheld residual / noise std", residuals**0.5), ("NIS/m", nis))
-        if curves.notna().to_numpy().any()]
-    if not shown:
-        return ""
-    figure, axes = _panels(len(shown), (10.5, 3.4))
-    for ax, (label, curves) in zip(axes, shown, strict=True):
-        _plot(ax, env, curves, label)
+def _residuals_over_time(env: MeasuredEnv, runs: Sequence[MeasuredRun]) -> Figure | None:
+    """Draw withheld residuals and NIS of each method, averaged over a warm-up."""
+    residuals, nis = (
+        pd.DataFrame(each).rolling(max(env.task.warm_up, 1), center=True, min_periods=1).mean()
+        for each in ({run.method: run.withheld_residual_rms**2 for run in runs},
+                     {run.method: run.nis for run in runs}))
+    figure = _curves(env, {"withheld residual / noise std": residuals**0.5, "NIS/m": nis}, 3.4)
+    for ax in figure.axes if figure else ():
         ax.axhline(1.0, color="0.7", linewidth=1)
         ax.set_yscale("log")
         ax.set_ylim(bottom=max(ax.get_ylim()[0], MIN_PLOTTED))
+    return figure
+
+
+def _velocity(env: MeasuredEnv, runs: Sequence[MeasuredRun]) -> Figure | None:
+    """Draw the velocity estimates of each method."""
+    velocity = {run.method: run.velocity[:, 0] for run in runs if run.velocity is not None}
+    return _curves(env, {"mean velocity / (m/s)": pd.DataFrame(velocity)}, 2.8)
+
+
+def _curves(env: MeasuredEnv, panels: dict[str, pd.DataFrame], height: float) -> Figure | None:
+    """Draw a column (T,) for each method over time, in a panel for each label -> curves; None
+    without data."""
+    shown = {label: each for label, each in panels.items() if each.notna().to_numpy().any()}
+    if not shown:
+        return None
+    figure, axes = _panels(len(shown), (10.5, height))
+    for ax, (label, curves) in zip(axes, shown.items(), strict=True):
+        for (method, values), colour in zip(curves.items(), cycle(LINE_COLOURS), strict=False):
+            ax.plot(env.measurements.times, values, color=colour, label=method)
+        ax.set(xlabel="time / s", ylabel=label)
     axes[0].legend(frameon=False, fontsize=9)
-    return _figure(figure)
-
-
-def _velocity(env: MeasuredEnv, runs: Sequence[MeasuredRun]) -> str:
-    """Velocity estimates over time as a data URI; empty if the velocity is not estimated."""
-    if env.task.velocity is None:
-        return ""
-    figure, (axes,) = _panels(1, (10.5, 2.8))
-    _plot(axes, env, pd.DataFrame({run.method: run.velocity[:, 0] for run in runs
-                                   if run.velocity is not None}), "mean velocity / (m/s)")
-    axes.legend(frameon=False, fontsize=9)
-    return _figure(figure)
-
-
-def _plot(axes: Axes, env: MeasuredEnv, curves: pd.DataFrame, label: str) -> None:
-    """Draw a column (T,) for each method over time."""
-    for (method, values), colour in zip(curves.items(), cycle(LINE_COLOURS), strict=False):
-        axes.plot(env.measurements.times, values, color=colour, label=method)
-    axes.set(xlabel="time / s", ylabel=label)
+    return figure
 
 
 def _fit(env: MeasuredEnv) -> Figure:
@@ -218,14 +214,3 @@ def _panels(count: int, size: tuple[float, float]) -> tuple[Figure, Sequence[Axe
     for ax in axes:
         ax.spines[["top", "right"]].set_visible(False)
     return figure, axes
-
-
-def _figure(figure: Figure) -> str:
-    """Draw a figure as a data URI."""
-    return data_uri(_image(figure))
-
-
-def _image(figure: Figure) -> Image.Image:
-    canvas = FigureCanvasAgg(figure)
-    canvas.draw()
-    return Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3].copy())

@@ -1,57 +1,94 @@
-"""One self-contained HTML page of results: tables, charts, pictures, failures, and sweeps."""
+"""One self-contained HTML page of results: tables, charts, pictures, failures, and sweeps. Failures
+are errors of a method in episodes of a run."""
 
 from __future__ import annotations
 
 import json
+import textwrap
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from PIL import Image
 
+from eitbench import _check
 from eitbench._files import write_atomically
 from eitbench._sanitize import sanitize
 from eitbench.bench import tracks
 from eitbench.bench.records import group_runs
+from eitbench.bench.run import Job
 from eitbench.bench.store import EpisodeStore
 from eitbench.bench.text import seed_ranges
 from eitbench.bench.tracks import Environment
 from eitbench.data.episode_cache import truth_mesh
-from eitbench.data.seeds import allow_test_seeds, parse_seeds
+from eitbench.data.episodes import simulate
+from eitbench.data.seeds import format_seed, parse_seeds
 from eitbench.envs.rendering import FIELD_COLORMAP, colour_range, draw_field
 from eitbench.numerics.mesh import Mesh
 from eitbench.report import tables
-from eitbench.report.boards import Leaderboard
-from eitbench.report.failures import failures
+from eitbench.report.boards import Leaderboard, episode_scores, restrict
 from eitbench.report.sweep import Sweep
-from eitbench.report.templates import data_uri, render_template
+from eitbench.report.templates import data_uri, figure_image, render_template
 from eitbench.worlds.task import Task
 
 N_SNAPSHOT_METHODS, N_SNAPSHOT_TIMES = 3, 4
 """Methods and states in the pictures of an episode."""
 
 
+class Failure(NamedTuple):
+    """One error of a method in some episodes of a record."""
+
+    record: dict[str, Any]
+    seeds: list[str]
+    message: str
+    traceback: str
+    """Lines of the method's own code; empty if the error was raised elsewhere."""
+
+    def __str__(self) -> str:
+        environment = self.record["environment"]["id"]
+        where = f"{self.record['method']} in {environment} on {seed_ranges(self.seeds)}"
+        return f"failed: {where}: {sanitize(self.message)}" + (
+            "\n" + textwrap.indent(self.traceback.rstrip(), "  ") if self.traceback else "")
+
+
+def select_requested(records: Iterable[dict[str, Any]], jobs: Iterable[Job],
+                     ) -> list[dict[str, Any]]:
+    """Return the records restricted to the episodes of these jobs."""
+    asked: dict[tuple[str, str], set[str]] = {}
+    for job in jobs:
+        name = job.environment.name, job.load().name
+        asked.setdefault(name, set()).add(format_seed(job.seed))
+    found = (restrict(record, asked.get((record["environment"]["name"], record["method"]), ()))
+             for record in records)
+    return [record for record in found if record["episodes"]]
+
+
+def failures(store: EpisodeStore, records: Iterable[dict[str, Any]]) -> list[Failure]:
+    """Return the failures of records of a store, in their order."""
+    found = []
+    for record in records:
+        seeds: dict[tuple[str, str], list[str]] = {}
+        for episode in record["episodes"]:
+            if episode["status"] != "ok":
+                error = episode["message"], store.traceback(record, episode["seed"])
+                seeds.setdefault(error, []).append(episode["seed"])
+        found += [Failure(record, those, *error) for error, those in seeds.items()]
+    return found
+
+
 def write_page(store: EpisodeStore, boards: Sequence[Leaderboard],
                sweeps: Sequence[Sweep] = ()) -> Path:
     """Write ``index.html``, which needs no other file and no network, and return its path."""
     shown = [tables.run_table(board, drawn=True) for board in boards]
-    sections = [{
-        "title": board.title,
-        "about": tables.run_title(board).removeprefix(f"{board.title}, "),
-        "table": table, "axes": tables.score_axes(board),
-        "curves": tables.curve_chart(board), "snapshots": _snapshots(store, board),
-        "failures": [(failure.record["title"], seed_ranges(failure.seeds), failure.message,
-                      failure.traceback) for failure in failures(store, board.records)],
-    } for board, table in zip(boards, shown, strict=True)]
     runs = [run for board in boards for record in board.records for run in record["runs"]]
     html = render_template(
-        "page.html.j2", root="", sections=sections, explanations=tables.explanations(shown),
-        sweeps=[(sweep, sweep.chart()) for sweep in sweeps],
+        "page.html.j2", root="", sections=list(zip(boards, shown, strict=True)), sweeps=sweeps,
+        tables=tables, explanations=tables.explanations(shown), seed_ranges=seed_ranges,
+        snapshots_of=partial(_snapshots, store), failures=partial(failures, store),
         colour_bar=_draw_bare(3.0, 0.12, lambda axes: axes.imshow(
             np.linspace(0, 1, 256)[None], cmap=FIELD_COLORMAP, aspect="auto")),
         runs=[group[0] for group in group_runs(runs, "command")])
@@ -63,44 +100,33 @@ def write_page(store: EpisodeStore, boards: Sequence[Leaderboard],
 def _snapshots(store: EpisodeStore, board: Leaderboard) -> dict[str, Any] | None:
     """Return truth and estimates in one episode, of the user's methods first and then of the best,
     without naive baselines, as PNG data; None if estimates are missing or do not fit the states."""
-    chosen = [(row, {episode["seed"] for episode in row.record["episodes"]
-                     if episode["status"] == "ok"})
-              for row in sorted(board.rows, key=lambda row: row.is_builtin)
-              if row.record and "floor" not in row.badges]
-    chosen = [(row, seeds) for row, seeds in chosen if seeds][:N_SNAPSHOT_METHODS]
-    shared = sorted(set.intersection(*(seeds for _, seeds in chosen))) if chosen else []
-    if not shared:
+    chosen = [row.record for row in sorted(board.rows, key=lambda row: row.is_builtin)
+              if row.record and episode_scores(row.record) and "floor" not in row.badges]
+    chosen = chosen[:N_SNAPSHOT_METHODS]
+    shared = set.intersection(*(set(episode_scores(each)) for each in chosen)) if chosen else ()
+    environment = board.records[0]["environment"]
+    if not shared or environment["id"] not in tracks.ids():  # its module may not be imported
         return None
-    seed = shared[0]
-    records = [row.record for row, _ in chosen if row.record]
+    seed = min(shared)
     try:
-        fields = [store.fields(record | {"seed": seed})["mean"] for record in records]
+        fields = [store.fields(record | {"seed": seed})["mean"] for record in chosen]
+        env: Any = Environment(environment["id"], json.dumps(environment["kwargs"])).make()
+        task = env.task
+        for field in fields:
+            _check.array("estimates", field, (task.n_steps, task.mesh.n_nodes))
     except FileNotFoundError:                                      # only the records were kept
         return None
     except ValueError as error:
         warnings.warn(f"no pictures of {seed}: {error}", stacklevel=2)
         return None
-    environment = records[0]["environment"]
-    if environment["id"] not in tracks.ids():       # of a module that this run did not import
-        return None
-    env: Any = Environment(environment["id"], json.dumps(environment["kwargs"])).make()
-    with allow_test_seeds():
-        env.reset(seed=parse_seeds(seed)[0])
-    task = env.task
-    if any(field.shape != (task.n_steps, task.mesh.n_nodes) for field in fields):
-        warnings.warn(f"no pictures of {seed}: estimates of {sanitize(environment['name'])} have "
-                      "another shape than its states", stacklevel=2)
-        return None
-    truth = env.truth()
+    truth = simulate(env.world, parse_seeds(seed)[0]).concentration
     times = task.warm_up + np.linspace(0.12, 0.88, N_SNAPSHOT_TIMES) * (task.n_steps - task.warm_up)
     rows = [(f"t = {1e3 * t * task.transport.time_step:.0f} ms",
-             [_picture(task, truth_mesh(env.world), truth[t - 1]),
+             [_picture(task, truth_mesh(env.world), truth[t]),
               *(_picture(task, task.mesh, field[t - 1]) for field in fields)])
             for t in np.unique(np.maximum(times.astype(int), task.warm_up + 1))]
-    low, high = colour_range(task)
-    return {"seed": seed, "columns": ["Truth", *(row.cells["title"] for row, _ in chosen)],
-            "rows": rows, "low": f"{low:g}", "high": f"{high:g}", "size": _size(task),
-            "tank": _is_tank(task)}
+    return {"seed": seed, "columns": ["Truth", *(record["title"] for record in chosen)],
+            "rows": rows, "range": colour_range(task), "size": _size(task), "tank": _is_tank(task)}
 
 
 def _is_tank(task: Task) -> bool:
@@ -132,6 +158,4 @@ def _draw_bare(width: float, height: float, draw: Callable[[Axes], object]) -> s
     axes = figure.add_axes((0, 0, 1, 1), facecolor="none")
     draw(axes)
     axes.axis("off")
-    canvas = FigureCanvasAgg(figure)
-    canvas.draw()
-    return data_uri(Image.fromarray(np.asarray(canvas.buffer_rgba())))
+    return data_uri(figure_image(figure))

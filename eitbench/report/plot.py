@@ -14,9 +14,11 @@ from tqdm import tqdm
 
 from eitbench import _check, scoring
 from eitbench.bench.evaluation import resolve_environment, resolve_method
+from eitbench.bench.methods import Method
 from eitbench.bench.runner import is_compatible, iter_estimates, iter_injections
 from eitbench.bench.scores import scores
 from eitbench.bench.text import mean_and_interval
+from eitbench.bench.tracks import subtrack_of
 from eitbench.data.episode_cache import region_operators, truth_mesh
 from eitbench.data.episodes import simulate
 from eitbench.data.seeds import format_seed, parse_seeds
@@ -48,10 +50,7 @@ def field(task: Task, c: Any, ax: Axes | None = None, *, currents: Any = None,
     Axes
         In cm. All fields of one task have one colour scale. In 3D the slice along the axis.
 
-    Raises
-    ------
-    ValueError
-        If ``c`` or ``currents`` has another shape, or is not finite.
+    ``ValueError`` if ``c`` or ``currents`` has another shape, or is not finite.
     """
     values = _check.array("c", getattr(c, "mean", c) if isinstance(c, tuple) else c,
                           (task.mesh.n_nodes,), units="mol/m³")
@@ -60,7 +59,9 @@ def field(task: Task, c: Any, ax: Axes | None = None, *, currents: Any = None,
     if ax is None:
         import matplotlib.pyplot as plt
         ax = plt.subplots(figsize=_size(task, 1, 1), layout="constrained")[1]
-    _draw_panel(ax, task, task.mesh, values, current, colour_bar=colour_bar)
+    drawn = _draw_panel(ax, task, task.mesh, values, current)
+    if colour_bar:
+        drawn.axes.figure.colorbar(drawn, ax=ax, label=FIELD_LABEL, extend="both")
     return ax
 
 
@@ -82,18 +83,13 @@ def episode(method: Any, env: str | gym.Env, seed: int | str, *,
     (times, 2) array of Axes
         Titles have the time and ẽ_c of the estimate.
 
-    Raises
-    ------
-    ValueError
-        If an argument is wrong, or the method does not suit the environment.
+    ``ValueError`` if an argument is wrong, or the method does not suit the environment.
     """
     import matplotlib.pyplot as plt
     asked = resolve_environment(env, world=world)
     loaded = resolve_method(method, asked.track)
     number = parse_single_seed(seed)
     made = asked.make()
-    if not is_compatible(loaded, made):
-        raise ValueError(f"method {loaded.name} is not compatible with {asked.id}")
     world_of = made.world
     _check.integer("times", times, low=1, high=world_of.schedule.scored_steps)
     wanted = list(map(int, np.linspace(world_of.warm_up + 1, world_of.n_steps, times + 2)[1:-1]))
@@ -131,10 +127,7 @@ def compare(table: pd.DataFrame | Iterable[pd.DataFrame], ax: Axes | None = None
     score : str
         A column of the tables.
 
-    Raises
-    ------
-    ValueError
-        If the table or the column is missing, or no method has the score.
+    ``ValueError`` if the table or the column is missing, or no method has the score.
     """
     tables = [table] if isinstance(table, pd.DataFrame) else list(table)
     if not tables or not all(isinstance(each, pd.DataFrame) for each in tables):
@@ -181,40 +174,40 @@ def parse_single_seed(seed: int | str) -> int:
     return numbers[0]
 
 
-def run_until(env: Any, method: Any, seed: int, last: int) -> Iterator[Any]:
-    """Yield what `iter_estimates` or `iter_injections` yields up to the state t = ``last``."""
+def run_until(env: Any, method: Method, seed: int, last: int) -> Iterator[Any]:
+    """Yield what `iter_estimates` or `iter_injections` yields up to the state t = ``last``;
+    ``ValueError`` if the method is not compatible with the environment."""
+    if not is_compatible(method, env):
+        raise ValueError(f"method {method.name} for {', '.join(method.subtracks)} is not "
+                         f"compatible with {env.spec.id}, a {subtrack_of(env)} environment")
     steps = iter_injections if isinstance(env, InjectionEnv) else iter_estimates
-    states = steps(env, method, seed)
-    for state in tqdm(states, total=last, desc="running", unit="state", disable=None):
+    for state in tqdm(steps(env, method, seed), total=last, desc="running", unit="state",
+                      disable=None):
         yield state
         if state[0] == last:
             break
 
 
-def states_at(env: Any, method: Any, seed: int, wanted: Collection[int],
+def states_at(env: Any, method: Method, seed: int, wanted: Collection[int],
               ) -> dict[int, tuple[np.ndarray, np.ndarray, np.ndarray]]:
     """Return t -> truth (m,) and estimate (n,) in mol/m³, and currents (L,) in A, of the wanted
     states."""
-    truth = simulate(env.world, seed).concentration
-    cycle = env.world.currents
-    found = {}
+    cycle, found = env.world.currents, {}
     for t, said, *_ in run_until(env, method, seed, max(wanted)):
         if t in wanted:
             mean, currents = ((env.core.estimate()[0][0], said["currents"])
                               if isinstance(env, InjectionEnv)
                               else (said.mean, cycle[(t - 1) % len(cycle)]))
-            found[t] = truth[t].astype(float), np.array(mean, dtype=float), currents
-    return found
+            found[t] = np.array(mean, dtype=float), currents
+    truth = simulate(env.world, seed).concentration
+    return {t: (truth[t].astype(float), *state) for t, state in found.items()}
 
 
-def _draw_panel(ax: Axes, task: Task, mesh: Mesh, values: np.ndarray, currents: np.ndarray, *,
-                colour_bar: bool = False) -> Any:
+def _draw_panel(ax: Axes, task: Task, mesh: Mesh, values: np.ndarray,
+                currents: np.ndarray) -> Any:
     drawn = draw_field(ax, mesh, values, *colour_range(task))
     draw_electrodes(ax, task, currents, width=3.0)
     ax.set_xlabel("z / cm" if mesh.dim == 3 else "x / cm")
-    if colour_bar:
-        assert ax.figure is not None
-        ax.figure.colorbar(drawn, ax=ax, label=FIELD_LABEL, extend="both")
     return drawn
 
 

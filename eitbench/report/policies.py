@@ -49,7 +49,7 @@ def adaptivity_gap(rows: pd.DataFrame, open_loop: Sequence[str] = OPEN_LOOP,
     errors = errors_by_policy(rows)
     blind = [name for name in open_loop if name in errors]
     needed = ["clairvoyant", "random_pair", *blind]
-    if not blind or set(needed) - set(errors) or errors[needed].isna().to_numpy().any():
+    if not blind or errors.reindex(columns=needed).isna().to_numpy().any():
         raise ValueError("rows must hold clairvoyant, random_pair and some open-loop policies on "
                          f"the same episodes; got {', '.join(map(str, errors))}")
     best = errors[blind].mean().idxmin()

@@ -8,12 +8,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from eitbench.bench.table import Table, mean_cell, number_cell
-from eitbench.bench.text import scores_by_seed
 from eitbench.bench.variants import flatten, format_setting
 from eitbench.report import charts
-from eitbench.report.boards import base_environment
-
-MAX_METHOD_CHARS = 30
+from eitbench.report.boards import base_environment, episode_scores
+from eitbench.report.tables import MAX_LABEL_CHARS
 
 
 class Sweep(NamedTuple):
@@ -29,12 +27,11 @@ class Sweep(NamedTuple):
 
     def table(self, *, intervals: bool = True) -> Table:
         """Return a row for each method and a column for each value."""
-        names = [format_setting(value) for value in self.values]
-        cells = {method: [mean_cell(errors) if intervals else number_cell(_mean(errors))
-                          for errors in each] for method, each in self.errors.items()}
-        return Table.of(({"method": charts.truncate(method, MAX_METHOD_CHARS),
-                          **dict(zip(names, each, strict=True))}
-                         for method, each in cells.items()), keep=names, label=self.title)
+        names = list(map(format_setting, self.values))
+        return Table.of(({"method": charts.truncate(method, MAX_LABEL_CHARS), **{
+            name: mean_cell(own) if intervals else number_cell(_mean(own))
+            for name, own in zip(names, each, strict=True)}}
+            for method, each in self.errors.items()), keep=names, label=self.title)
 
     def text(self, width: int) -> str:
         """Return the table, with intervals if lines of ``width`` characters hold them."""
@@ -77,16 +74,13 @@ def sweeps(records: Iterable[dict[str, Any]], number: str) -> list[Sweep]:
     values: dict[str, Any] = {}
     for record in records:
         value = flatten(record["environment"]["kwargs"].get("world", {})).get(number)
-        values[format_setting(value)] = value
+        name = format_setting(value)
+        values[name] = value
         title = f"{base_environment(record['environment']['id'])}, {record['board']}"
-        own = boards.setdefault(title, {}).setdefault(record["method"], {})
-        own[format_setting(value)] = list(scores_by_seed(record, "error").values())
-
-    def order(name: str) -> tuple[bool, Any]:
-        is_number = isinstance(values[name], int | float)
-        return not is_number, values[name] if is_number else name
-
-    names = sorted(values, key=order)
+        methods = boards.setdefault(title, {})
+        methods.setdefault(record["method"], {})[name] = list(episode_scores(record).values())
+    names = sorted(values, key=lambda name: (  # numbers first
+        (0, values[name]) if isinstance(values[name], int | float) else (1, name)))
     return [Sweep(title, number, [values[name] for name in names],
                   {method: [own.get(name, []) for name in names]
                    for method, own in methods.items()})

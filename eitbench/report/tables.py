@@ -4,28 +4,24 @@ seed are one row of a page."""
 from __future__ import annotations
 
 import math
-import re
-from collections import Counter
 from collections.abc import Iterable, Sequence
+from itertools import islice
 from urllib.parse import quote
 
 import numpy as np
-import pandas as pd
 
 from eitbench._sanitize import escape_markdown
-from eitbench.bench.statistics import agent_name, mean_by_seed
 from eitbench.bench.table import MISSING, Cell, Table, mean_cell, number_cell
-from eitbench.bench.table import Row as TableRow
-from eitbench.bench.text import format_interval, format_number, scores_by_seed
+from eitbench.bench.text import format_interval, format_number
 from eitbench.report import charts
 from eitbench.report.boards import (
     COST_COLUMNS,
+    INTERVAL_HEADINGS,
     Leaderboard,
     MethodRow,
     column_descriptions,
     columns,
-    episode_errors,
-    error_and_skill,
+    episode_scores,
     headings,
     naive_baseline_record,
 )
@@ -34,52 +30,12 @@ INDEX_COLUMNS = ("seconds_per_step", "peak_memory")
 """Number columns of the index page; the page of an environment has all."""
 SKILL_AXIS_MIN = -1.0
 """Lower end of the axis of skill scores: twice the error of the naive baseline."""
-INTERVAL_HEADINGS = {"error": "ẽ_c", "gain": "skill score"}
-"""Score with an interval -> heading."""
 COLUMN_PRIORITY = ("method", "ẽ_c", "withheld RMSE", "normalised score", "seeds", "NIS/m",
                    "ms/step", "contrast error", "contrast", "ẽ_v")
 """Columns by priority in a narrow table; columns that are not listed are omitted first."""
 MAX_LABEL_CHARS = 30
 BADGES = {"floor": "naive baseline", "reference": "oracle"}
 """Role in a record -> badge."""
-
-
-# -- trainings -------------------------------------------------------------------------------------
-
-
-def group_by_agent(board: Leaderboard) -> list[MethodRow]:
-    """Return the rows of a leaderboard in its order, training seeds of an agent grouped.
-
-    Agents with at least two ranked training seeds become one row: the mean over these seeds, with
-    the interval over the episodes of the seeds' mean scores.
-    """
-    groups: dict[str, list[MethodRow]] = {}
-    for row in board.rows:
-        if not row.has_no_rank:
-            groups.setdefault(row.agent, []).append(row)
-    means = [_agent_mean(board, rows) for rows in groups.values()
-             if sum(row.is_ranked for row in rows) > 1]
-    grouped = {row.label for mean in means for row in mean.trainings}
-    return sorted(means + [row for row in board.rows if row.label not in grouped],
-                  key=MethodRow.place)
-
-
-def _agent_mean(board: Leaderboard, rows: list[MethodRow]) -> MethodRow:
-    """Return the mean of the trainings of an agent."""
-    ranked = [row for row in rows if row.is_ranked]
-    first, unfinished = ranked[0], len(rows) - len(ranked)
-    frame = pd.DataFrame([row.cells for row in ranked])
-    means = frame[[*INTERVAL_HEADINGS, *headings()]].astype(float).mean()
-    cells = first.cells | means.astype(object).where(means.notna(), None).to_dict() | dict.fromkeys(
-        f"{name}_{end}" for name in INTERVAL_HEADINGS for end in ("low", "high"))
-    errors = mean_by_seed([episode_errors(row.record) for row in ranked])
-    if errors:
-        cells |= error_and_skill(errors, episode_errors(naive_baseline_record(board.records)))
-    return first._replace(record=None, trainings=tuple(rows), cells=cells | {
-        "method": agent_name(first.cells["method"]),
-        "note": f"{unfinished} of {len(rows)} unfinished" if unfinished else "",
-        "title": re.sub(r" trained with seed \d+$", "", first.cells["title"]),
-        "version": first.cells["version"] if frame["version"].nunique() == 1 else ""})
 
 
 # -- cells -----------------------------------------------------------------------------------------
@@ -89,20 +45,16 @@ def score_axes(board: Leaderboard) -> dict[str, charts.Axis]:
     """Return heading -> axis of each score with an interval, which the rows of a board share, with
     a mark at the naive baseline: linear for skill scores, cut at `SKILL_AXIS_MIN`, otherwise
     logarithmic."""
+    def ends(name: str) -> list[float]:
+        return [end for row in board.rows for end in row.interval(name) if math.isfinite(end)]
+
     floor = naive_baseline_record(board.records)
-    zero = next((row.cells["error"] for row in board.rows if floor and row.record is floor), None)
-    axes = {}
-    for name, heading in INTERVAL_HEADINGS.items():
-        is_gain = name == "gain"
-        ends = [end for row in board.rows for end in row.interval(name) if math.isfinite(end)]
-        if is_gain:
-            low, high = max(min([0.0, *ends]), SKILL_AXIS_MIN), 1.0
-        else:
-            positive = [end for end in ends if end > 0] or [1.0]
-            low, high = min(positive), max(positive)
-        axes[heading] = charts.Axis(low, high, 4, charts.CELL_WIDTH_PX - 4, log=not is_gain,
-                                    mark=0.0 if is_gain else zero)
-    return axes
+    zero = next((row.cells["error"] for row in board.rows if row.record is floor), None)
+    errors = [end for end in ends("error") if end > 0] or [1.0]
+    least = max(min([0.0, *ends("gain")]), SKILL_AXIS_MIN)
+    width = charts.CELL_WIDTH_PX - 4
+    return {"ẽ_c": charts.Axis(min(errors), max(errors), 4, width, log=True, mark=zero),
+            "skill score": charts.Axis(least, 1.0, 4, width, log=False, mark=0.0)}
 
 
 def _interval_cells(row: MethodRow, axes: dict[str, charts.Axis]) -> dict[str, Cell]:
@@ -126,15 +78,13 @@ def interval_cell(row: MethodRow, name: str, axis: charts.Axis) -> Cell:
 
 
 def _number_cells(row: MethodRow, names: Iterable[str]) -> dict[str, Cell]:
-    known = columns()
-    return {known[name][0]: number_cell(row.cells[name]) for name in names}
+    return {headings()[name]: number_cell(row.cells[name]) for name in names}
 
 
-def _rank_cell(row: MethodRow, shared: Counter[int | None]) -> Cell:
+def _rank_cell(row: MethodRow, rows: list[MethodRow]) -> Cell:
     rank = row.cells["rank"]
-    if rank is None:
-        return Cell(MISSING)
-    return Cell(f"{rank}", float(rank), note="tied" if shared[rank] > 1 else "")
+    is_tied = row.is_ranked and sum(other.cells["rank"] == rank for other in rows) > 1
+    return number_cell(rank)._replace(note="tied" if is_tied else "")
 
 
 def method_cell(row: MethodRow, root: str, more: Iterable[str] = ()) -> Cell:
@@ -164,46 +114,37 @@ def filter_flags(row: MethodRow) -> str:
 
 def page_table(board: Leaderboard, root: str, *, compact: bool = False) -> Table:
     """Return a board for a page; ``root`` leads from the page to the site's folder."""
-    axes = score_axes(board)
-    together = group_by_agent(board)
-    outperformed = _beaten_oracles(together)
-    shared = Counter(row.cells["rank"] for row in together)
+    axes, together = score_axes(board), board.grouped()
 
     def cells(row: MethodRow) -> dict[str, Cell]:
-        more = [*outperformed.get(row.label, ()), *author_badges(row)]
-        return {"rank": _rank_cell(row, shared), "method": method_cell(row, root, more),
+        badges = _outperformed(row, together) + author_badges(row)
+        return {"rank": _rank_cell(row, together), "method": method_cell(row, root, badges),
                 **_interval_cells(row, axes),
                 **_number_cells(row, INDEX_COLUMNS if compact else headings())}
 
-    def part(row: MethodRow) -> TableRow:
-        own = cells(row)
-        return TableRow([own[heading] for heading in made.headings], filter_flags(row))
+    every = [each for row in together for each in (row, *row.trainings)]
+    made = Table.of(map(cells, every), label=board.title, keep=["rank"],
+                    flags=list(map(filter_flags, every)))
+    lines = iter(made.rows)
+    return made._replace(rows=[
+        next(lines)._replace(children=tuple(islice(lines, len(row.trainings))))
+        for row in together])
 
-    made = Table.of(map(cells, together), label=board.title, keep=["rank"],
-                    flags=list(map(filter_flags, together)))
-    return made._replace(rows=[line._replace(children=tuple(map(part, row.trainings)))
-                               for line, row in zip(made.rows, together, strict=True)])
 
-
-def _beaten_oracles(together: list[MethodRow]) -> dict[str, list[str]]:
-    """Return label of an oracle -> a note that ranked methods have a smaller error."""
-    found = {}
-    before: list[str] = []
-    for row in together:
-        if row.is_ranked:
-            before.append(row.cells["title"])
-        elif before and "reference" in row.badges:
-            better = before[0] if len(before) == 1 else f"{len(before)} others"
-            found[row.label] = [f"outperformed here by {better}"]
-    return found
+def _outperformed(row: MethodRow, rows: list[MethodRow]) -> list[str]:
+    """Return a badge for an oracle if ranked methods have a smaller error."""
+    better = [other.cells["title"] for other in rows
+              if other.is_ranked and other.place() < row.place()]
+    if "reference" not in row.badges or not better:
+        return []
+    return [f"outperformed here by {better[0] if len(better) == 1 else f'{len(better)} others'}"]
 
 
 def markdown_table(board: Leaderboard) -> Table:
     """Return a board as text: one row for each record."""
     axes = score_axes(board)
-    shared = Counter(row.cells["rank"] for row in board.rows)
     return Table.of([{
-        "rank": _rank_cell(row, shared), "method": method_cell(row, ""),
+        "rank": _rank_cell(row, board.rows), "method": method_cell(row, ""),
         **_interval_cells(row, axes),
         "run by": "".join(author_badges(row)) or "official",
         **_number_cells(row, headings())} for row in board.rows], keep=["rank"])
@@ -221,26 +162,21 @@ def run_table(board: Leaderboard, *, title: str = "title", drawn: bool = False) 
     best = next((row for row in board.rows if row.complete and "privileged" not in row.badges),
                 None) if board.category == "injection" and len(board.rows) > 1 else None
     seeds = run_seeds(board)
-    others = [name for name in headings(measured=True) if name not in COST_COLUMNS]
-    is_measured = board.category == "measured"
-    if is_measured:
-        others.remove("prediction_error")
+    score = "prediction_error" if board.category == "measured" else "error"
+    others = [name for name in headings() if name not in (score, *COST_COLUMNS)]
     rows = []
     for row, played in zip(board.rows, seeds, strict=True):
-        privileged = tuple(word for word in row.badges if word == "privileged")
+        name, own = row.cells[title], episode_scores(row.record, score)
         cells: dict[str, Cell | str] = {
-            "method": Cell(row.cells[title], row.cells[title], badges=privileged)}
+            "method": Cell(name, name, badges=("privileged",) * ("privileged" in row.badges))}
         if len(set(seeds)) > 1:
             cells["seeds"] = played
-        if is_measured:
-            residuals = scores_by_seed(row.record, "prediction_error") if row.record else {}
-            cells[columns()["prediction_error"][0]] = mean_cell(residuals.values())
-        elif drawn:
+        if drawn and score == "error":
             cells |= _interval_cells(row, axes)
         else:
-            cells["ẽ_c"] = mean_cell(episode_errors(row.record).values())
+            cells[columns()[score][0]] = mean_cell(own.values())
         if best:
-            own, other = episode_errors(row.record), episode_errors(best.record)
+            other = episode_scores(best.record)
             cells[f"difference to {best.cells['method']}"] = Cell(MISSING) if row is best else (
                 mean_cell(own[seed] - other[seed] for seed in own.keys() & other.keys()))
         cells |= _number_cells(row, others)
@@ -267,7 +203,7 @@ def run_title(board: Leaderboard) -> str:
 def explanations(tables: Iterable[Table]) -> dict[str, str]:
     """Return heading -> explanation of the headings of these tables."""
     shown = {heading for each in tables for heading in each.headings}
-    return {heading: text for heading, text in column_descriptions(measured=True).items()
+    return {heading: text for heading, text in column_descriptions().items()
             if heading in shown}
 
 
@@ -313,7 +249,7 @@ def cost_chart(board: Leaderboard) -> charts.Chart | None:
     None without data."""
     points = [charts.ParetoPoint(row.cells["title"], row.colour, row.cells["seconds_per_step"],
                            row.cells["error"], row.is_ranked)
-              for row in group_by_agent(board)
+              for row in board.grouped()
               if row.cells["error"] is not None and row.cells["seconds_per_step"]]
     if not points:
         return None

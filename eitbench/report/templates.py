@@ -7,8 +7,7 @@ import io
 import re
 from collections.abc import Callable
 from functools import lru_cache
-from typing import Any
-from urllib.parse import quote
+from typing import TYPE_CHECKING, Any
 
 import jinja2
 from markdown_it import MarkdownIt
@@ -17,13 +16,8 @@ from PIL import Image
 
 from eitbench._sanitize import escape_markdown, sanitize
 
-_DRAWING = ('<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 32 32">'
-            '<rect y="5" width="32" height="22" rx="5" fill="#0b6e75"/>'
-            '<path d="M4 21C12 12 18 20 28 11" stroke="#f0c246" stroke-width="5" fill="none"/>'
-            '</svg>')
-ICON = f"data:image/svg+xml,{quote(_DRAWING, safe='')}"
-"""Icon of the browser's tab: a pipe with a slug."""
-
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 N_COLOURS = 12
 """--c0 … --c11 of the style sheet; further series repeat them, dashed."""
@@ -39,7 +33,7 @@ def _environment() -> jinja2.Environment:
     made = jinja2.Environment(loader=jinja2.PackageLoader("eitbench.report", "."), autoescape=True,
                               trim_blocks=True, lstrip_blocks=True, keep_trailing_newline=True,
                               undefined=jinja2.StrictUndefined, finalize=_finalize)
-    made.globals |= {"add_line_breaks": add_line_breaks, "icon": ICON, "n_colours": N_COLOURS}
+    made.globals |= {"add_line_breaks": add_line_breaks, "n_colours": N_COLOURS}
     made.filters |= {"tick": format_tick, "escape_markdown": escape_markdown}
     return made
 
@@ -81,6 +75,13 @@ def markdown(text: str) -> Markup:
     html = reader.renderer.render(tokens, reader.options, {})
     begin = '<div class="card" tabindex="0" role="region" aria-label="table"><table>'
     return Markup(html.replace("<table>", begin).replace("</table>", "</table></div>"))
+
+
+def figure_image(figure: Figure) -> Image.Image:
+    """Return a figure as a picture."""
+    content = io.BytesIO()
+    figure.savefig(content, format="png")
+    return Image.open(content)
 
 
 def data_uri(image: Image.Image, kind: str = "png", **options: Any) -> str:

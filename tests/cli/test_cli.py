@@ -177,7 +177,7 @@ def test_documented_commands_are_commands():
      "baseline mine.py suits none of the environments"),
     (["leaderboard", "-o", "nothing"], "no results in nothing; create some with `eitbench run`"),
     (["render", "--step", "3"], "out must end in .png with step"),
-    (["render", "--baseline", "fixed_interval_smoother"], "smoothing, but eitbench/Pipe2D-v0 is a filter"),
+    (["render", "--baseline", "fixed_interval_smoother"], "not compatible with eitbench/Pipe2D-v0, a filter"),
     (["render", "--env", INJECTION], f"policy must be given for {INJECTION}"),
     (["render", "--env", INJECTION, "--policy", "random_pair", "--step", "1", "-o", "a.png"],
      "step must be an integer of at least 17 and at most 22, got 1"),

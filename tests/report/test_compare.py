@@ -12,7 +12,6 @@ from eitbench.report import compare as comparison
 from eitbench.report.compare import (
     compare,
     comparison_table,
-    display_names,
     find_records,
     format_comparison,
     naive_baseline_records,
@@ -22,7 +21,7 @@ from tables import boards, said
 from tiny import record, sha
 
 TANK = "eitbench/RotatingTank2D-v0"
-PIPE_NAME, TANK_NAME = "eitbench/Pipe2D-v0", "eitbench/RotatingTank2D-v0"
+PIPE_NAME, TANK_NAME = "eitbench/Pipe2D-v0", TANK
 
 
 def two_methods():
@@ -67,6 +66,7 @@ def test_an_agent_is_the_mean_of_its_trainings(tmp_path):
     assert table["a"].item() == pytest.approx(errors[:2, :7].mean()) and table["episodes"].item() == 7
     (mean,) = find_records("ppo", tmp_path)
     assert (mean["method"], mean["version"]) == ("ppo", "mean over trainings")
+    assert compare([mean], [mean], "seconds_per_step")["a"].item() == pytest.approx(10.0)             # ms
 
 
 def test_over_environments_gains_are_compared():
@@ -84,18 +84,15 @@ def test_over_environments_gains_are_compared():
     one, other = ({name: {seed: 1 - error / scale for seed, error in errors.items()}
                    for (name, errors), scale in zip(errors_of(side).items(), (0.02, 2.0), strict=True)}
                   for side in (a, b))
-    assert table["a"][2] == pytest.approx(interquartile_mean(*[list(each.values()) for each in one.values()]))
     assert tuple(table.loc[2, ["advantage", "low", "high"]]) == pytest.approx(
         paired_difference(one, other, statistic=interquartile_mean), rel=1e-12)
     assert table["low"][2] > 0 and table["better"][2] == 0.5
-    on_boards = boards([*floor, *a, *b])
-    gains = on_boards[on_boards["environment"] == "all"].set_index("method")["gain"]
+    gains = boards([*floor, *a, *b]).query("environment == 'all'").set_index("method")["gain"]
     assert (table["a"][2], table["b"][2]) == pytest.approx((gains["a"], gains["b"]), rel=1e-12)
-    text = said(comparison_table(table, "a", "b"))
-    assert list(text["better"]) == ["a", "b", "a"] and text["ẽ_c of a"][2].startswith("skill score 0.")
+    text = said(comparison_table(table))
+    assert list(text["better"]) == ["A", "B", "A"] and text["ẽ_c of A"][2].startswith("skill score 0.")
     assert list(compare(a, b)["environment"]) == [PIPE_NAME, TANK_NAME]
-    others = compare(a, b, "seconds_per_step", floor)
-    assert list(others["environment"]) == [PIPE_NAME, TANK_NAME, "all"]
+    assert list(compare(a, b, "seconds_per_step", floor)["environment"]) == [PIPE_NAME, TANK_NAME, "all"]
 
 
 def test_only_shared_episodes_count():
@@ -130,14 +127,12 @@ def test_records_are_found_by_name_version_and_file(tmp_path, monkeypatch):
     with pytest.raises(ValueError, match=rf"a fits several versions: a@{sha('a2')[:8]}, a@{sha('a1')[:8]}"):
         find_records("a", tmp_path)
     assert find_records(f"a@{sha('a2')[:8]}", tmp_path) == [newer]
-    assert display_names(newer, a[0]) == (f"a@{sha('a2')[:8]}", f"a@{sha('a1')[:8]}")
-    assert display_names(newer, b) == ("a", "b")
-    ours = [record("c", [0.1], version=version) for version in ("v1", "v2")]
-    for each in ours:
+    for other, names in ((a[0], f"A: a@{sha('a2')[:8]}\nB: a@{sha('a1')[:8]}\n"), (b, "A: a\nB: b\n")):
+        assert format_comparison(compare([newer], [other]), newer, other, "error", 100).startswith(names)
+    ours = [record("c", [0.1], version=version) for version in ("v1", "v2", "v10")]
+    for i, each in enumerate(ours):
         write_record(tmp_path, each)
-    assert find_records("c", tmp_path) == ours[1:] and find_records("c@v1", tmp_path) == ours[:1]
-    write_record(tmp_path, tenth := record("c", [0.1], version="v10"))
-    assert find_records("c@v1", tmp_path) == ours[:1] and find_records("c", tmp_path) == [tenth]
+        assert find_records("c@v1", tmp_path) == ours[:1] and find_records("c", tmp_path) == [ours[i]]
     for nobody in ("d", "c@v"):
         with pytest.raises(ValueError, match=f"record of {nobody} "):
             find_records(nobody, tmp_path)
@@ -147,18 +142,17 @@ def test_words_follow_from_the_intervals():
     """The conclusion names the better method, if significant; the Markdown is a table of the same text."""
     a, b = two_methods()
     table = compare(a, b)
-    text = said(comparison_table(table, "mine", "yours"))
-    assert text["better"][1] == "mine"
-    assert said(comparison_table(compare(b, a), "yours", "mine"))["better"][1] == "mine"
+    text = said(comparison_table(table))
+    assert text["better"][1] == "A" and said(comparison_table(compare(b, a)))["better"][1] == "B"
     low, high = table["low"][0], table["high"][0]
-    assert text["better"][0] == ("mine" if low > 0 else "yours" if high < 0 else "–")
-    assert re.fullmatch(r"0\.\d+ \(0\.\d+ to 0\.\d+\)", text["advantage of mine"][1])
-    assert re.fullmatch(r"\d+ % \(\d+ to \d+ %\)", text["mine better"][0])
-    lines = comparison_table(table, "mine", "yours").markdown().splitlines()
+    assert text["better"][0] == ("A" if low > 0 else "B" if high < 0 else "–")
+    assert re.fullmatch(r"0\.\d+ \(0\.\d+ to 0\.\d+\)", text["advantage of A"][1])
+    assert re.fullmatch(r"\d+ % \(\d+ to \d+ %\)", text["A better"][0])
+    lines = comparison_table(table).markdown().splitlines()
     assert len(lines) == 4 and len({len(line) for line in lines}) == 1 and all(
         cell in lines[3] for cell in text.iloc[1])
-    few = said(comparison_table(compare([record("a", [0.1])], [record("b", [0.4])]), "a", "b"))
-    assert (few["better"][0], few["a better"][0], few["advantage of a"][0]) == ("–", "100 %", "0.3")
+    few = said(comparison_table(compare([record("a", [0.1])], [record("b", [0.4])])))
+    assert (few["better"][0], few["A better"][0], few["advantage of A"][0]) == ("–", "100 %", "0.3")
 
 
 def test_methods_that_are_not_in_the_folder_are_found_in_the_package(tmp_path, monkeypatch):
@@ -176,7 +170,8 @@ def test_lines_are_not_wrapped_in_a_terminal():
     """Names are above the table, and omitted columns are named below."""
     a, b = two_methods()
     table = compare(a, b)
-    whole, narrow = (format_comparison(table, "a_long_name", "another", "error", letters) for letters in (200, 60))
+    names = [{"method": name, "version": "v1"} for name in ("a_long_name", "another")]
+    whole, narrow = (format_comparison(table, *names, "error", letters) for letters in (200, 60))
     assert whole.startswith("A: a_long_name\nB: another\n\n| environment") and "columns omitted" not in whole
     assert narrow.endswith("episodes, ẽ_c of A, ẽ_c of B, A better")
     rows = narrow.split("\n\n")[1].splitlines()

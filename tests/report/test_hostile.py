@@ -1,20 +1,18 @@
 """Third-party text in records is escaped on every page; damaged records are named and ignored."""
 
 import re
-from pathlib import Path
 
 import pytest
 from eitbench._sanitize import sanitize
 from eitbench.bench.records import read_records, with_content_hash, write_record
 from eitbench.bench.store import EpisodeStore
 from eitbench.bench.tracks import environment_name
-from eitbench.cli.app import app
 from eitbench.report.boards import run_leaderboards
 from eitbench.report.page import write_page
 from eitbench.report.site import collect, render, render_site
 from pages import Page
-from typer.testing import CliRunner
 
+from commands import eitbench
 from tiny import BOARD_IDS, RUN, record
 
 TEXTS = ["<script>alert(1)</script>", "<b onmouseover=alert(1)>", "\"'><img src=http://x>", "| a | b |", "{{ 7*7 }}",
@@ -63,14 +61,6 @@ def test_text_stays_text(text, tmp_path):
         assert ",'=1+1," in texts["leaderboard.csv"]
 
 
-def leaderboard(folder):
-    """Return exit status, and standard output and error without boxes and line breaks."""
-    done = CliRunner().invoke(app, ["leaderboard", "--records", str(folder)])
-    if done.exception is not None and not isinstance(done.exception, SystemExit):
-        raise done.exception
-    return done.exit_code, done.stdout, re.sub(r"[│╭╮╰╯─\s]+", " ", done.stderr)
-
-
 def content(folder):
     """Map the path of each file to its bytes."""
     return {path.relative_to(folder): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
@@ -84,8 +74,8 @@ def test_damaged_records_are_named_and_change_nothing(tmp_path):
     for name in ("x.json", "\x1b[2J\u202e.json"):
         (tmp_path / "among" / "results" / name).write_text("{")
     write_record(tmp_path / "among" / "results", record("mine", {"dev:0": 0.1}))
-    assert leaderboard(tmp_path / "alone" / "results")[0] == 0
-    code, _, complaint = leaderboard(tmp_path / "among" / "results")
+    assert eitbench("leaderboard", "--records", tmp_path / "alone" / "results")[0] == 0
+    code, _, complaint = eitbench("leaderboard", "--records", tmp_path / "among" / "results")
     assert code == 1 and complaint.count("left out: record") == 3
     assert "x.json cannot be read" in complaint and "\\x1b[2J\\u202e.json cannot" in complaint
     assert "--dev.json has dev seeds" in complaint
@@ -101,13 +91,12 @@ def test_damaged_records_are_named_and_change_nothing(tmp_path):
 def test_a_folder_without_records_deletes_nothing(left, tmp_path):
     """A missing folder, or one with damaged records only, leads to exit status 2 without changes."""
     write_record(tmp_path / "results", record("homogeneous", [0.2, 0.3], role="floor"))
-    assert leaderboard(tmp_path / "results")[0] == 0
-    wrong = Path(tmp_path / "result")
-    wrong.mkdir()
+    assert eitbench("leaderboard", "--records", tmp_path / "results")[0] == 0
+    (wrong := tmp_path / "result").mkdir()
     if left:
         (wrong / left).write_text("{")
     before = content(tmp_path)
-    code, said, complaint = leaderboard(wrong)
+    code, said, complaint = eitbench("leaderboard", "--records", wrong)
     assert code == 2 and said == "" and "records must be a folder with records" in complaint
     assert ("x.json cannot be read" in complaint) == (left == "x.json")
     assert content(tmp_path) == before

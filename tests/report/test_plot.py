@@ -86,8 +86,8 @@ def test_an_episode_of_a_policy():
     assert axes.shape == (1, 2) and "random_pair, ẽ_c =" in axes[0, 1].get_title()
     with pytest.raises(ValueError, match="times must be an integer of at least 1 and at most 3, got 6"):
         eitbench.plot.episode("homogeneous", PIPE, 3, world=world(PIPE)["world"], times=6)
-    with pytest.raises(ValueError, match="method fixed_interval_smoother is not compatible"):
-        eitbench.plot.episode("fixed_interval_smoother", PIPE, 3, world=world(PIPE)["world"])
+    with pytest.raises(ValueError, match="method fixed_interval_smoother for smoothing is not compatible"):
+        eitbench.plot.episode("fixed_interval_smoother", PIPE, 3, world=world(PIPE)["world"], times=1)
     with pytest.raises(ValueError, match="seed must name one episode, as in 'dev:0', got 'dev:0-1'"):
         eitbench.plot.episode("homogeneous", PIPE, "dev:0-1", world=world(PIPE)["world"])
 

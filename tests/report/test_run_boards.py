@@ -79,12 +79,6 @@ def test_numbers_are_short_and_never_powers_of_ten(value, text):
 # -- skill ------------------------------------------------------------------------------------------------------------
 
 
-def test_skill_of_the_anchors():
-    """The normalised score is 0 for the homogeneous estimate in smoothing, 1 for the smoother with the true model."""
-    assert row(ANCHORS, "homogeneous", "smoothing")["skill"] == 0.0
-    assert row(ANCHORS, "true_model_smoother", "smoothing")["skill"] == 1.0
-
-
 @pytest.mark.parametrize("board", ["filter", "fixed-lag", "smoothing"])
 def test_skill_is_measured_on_shared_episodes(board):
     """Means are over the common episodes of all three: here only the first, (20 − 8)/(20 − 4)."""
@@ -94,14 +88,14 @@ def test_skill_is_measured_on_shared_episodes(board):
 
 
 def test_skill_needs_its_anchors():
-    """Without one of the anchors, or with anchors of another world, the normalised score is missing."""
+    """The normalised score is 0 for the homogeneous estimate in smoothing, 1 for the smoother with the true model.
+    Without one of these, or with anchors of another world, it is missing."""
+    assert [row(ANCHORS, each["method"], "smoothing")["skill"] for each in ANCHORS] == [0.0, 1.0]
     mine = made("mine", "filter", FLOOR)
-    for others in ([], ANCHORS[:1], ANCHORS[1:]):
-        assert row([*others, mine], "mine", "filter")["skill"] is None
     elsewhere = made("mine", "filter", FLOOR, kwargs={"world": {"schedule": {"scored_steps": 16}}})
-    assert row([*ANCHORS, elsewhere], "mine", "filter")["skill"] is None
     theirs = [anchor | {"version": "1" * 8} for anchor in ANCHORS]             # third-party files with these names
-    assert row([*theirs, mine], "mine", "filter")["skill"] is None
+    for records in ([mine], [*ANCHORS[:1], mine], [*ANCHORS[1:], mine], [*ANCHORS, elsewhere], [*theirs, mine]):
+        assert row(records, "mine", "filter")["skill"] is None
     assert row([*theirs, mine], "mine", "filter")["gain"] is None
     # an assumed velocity does not change the world and its anchors
     wrong = made("mine", "filter", FLOOR, kwargs={"assume": {"mean_velocity": 7.0}})
@@ -202,8 +196,8 @@ def test_markdown_is_a_table():
     """Every line has the same number of cells and the same width, for any title."""
     odd = made("mine", "filter", [0.1, 0.2], title="mine | yours")
     lines = markdown(run_leaderboards([odd, made("b", "filter", [0.2])])).splitlines()[2:]
-    assert len(lines) == 4 and re.fullmatch(r"[|:-]+", lines[1]) and len({len(line) for line in lines}) == 1
-    assert len({len(re.findall(r"(?<!\\)\|", line)) for line in lines}) == 1
+    assert len(lines) == 4 and re.fullmatch(r"[|:-]+", lines[1])
+    assert len({(len(line), len(re.findall(r"(?<!\\)\|", line))) for line in lines}) == 1
 
 
 def test_seeds_are_named_by_their_ranges():

@@ -1,10 +1,9 @@
 """The site: numbers of the leaderboards, valid links, offline, reproducible."""
 
 import hashlib
+import importlib
 import re
 from pathlib import Path
-from posixpath import dirname, join, normpath
-from urllib.parse import unquote, urlsplit
 
 import numpy as np
 import pytest
@@ -16,8 +15,6 @@ from eitbench.bench.tracks import ids
 from eitbench.report.site import (
     HEADLINE,
     LINKS,
-    METHODS_FOLDER,
-    ROBUSTNESS_PAGE,
     collect,
     documentation,
     headline,
@@ -26,33 +23,34 @@ from eitbench.report.site import (
     write_site,
 )
 from eitbench.report.site.robustness import shift_families, shift_heading
-from eitbench.report.tables import BADGES, group_by_agent, markdown_table, page_table
+from eitbench.report.tables import BADGES, markdown_table, page_table
 from eitbench.report.templates import N_COLOURS, markdown
-from pages import Page, text_of
+from pages import text_of
 
 from tables import said
 from tiny import BOARD_IDS, RUN, record, several_boards
 
 ROOT = Path(__file__).parents[2]
 BUDGET = "eitbench/Pipe2DInjectionBudget-v0"
-PICTURES = {"eitbench-Pipe2D-v0.webp": 340_000} | dict.fromkeys(HEADLINE, 1)
+PICTURES = {"media/eitbench-Pipe2D-v0.webp": 340_000} | dict.fromkeys(HEADLINE, 1)
 FLOOR = {"role": "floor", "official": True}
 
 
-def rendered(records):
-    site = collect(records)._replace(media=PICTURES)
-    return {path: content.decode() for path, content in render_site(site).items()}
+@pytest.fixture(scope="module")
+def rendered(tmp_path_factory):
+    """Return a function that renders a site next to pictures."""
+    folder = tmp_path_factory.mktemp("leaderboards")
+    for name, size in PICTURES.items():
+        (folder / name).parent.mkdir(exist_ok=True)
+        (folder / name).write_bytes(b"0" * size)
+    return lambda records: {path: content.decode() for path, content in
+                            render_site(collect(records, folder)).items()}
 
 
 @pytest.fixture(scope="module")
-def site():
+def site(rendered):
     """Return a site of several leaderboards, with an animation."""
     return rendered(several_boards())
-
-
-@pytest.fixture(scope="module")
-def pages(site):
-    return {path: content for path, content in site.items() if path.endswith(".html")}
 
 
 # -- up to date, reproducible -----------------------------------------------------------------------------------------
@@ -72,7 +70,7 @@ def test_published_files_are_rendered_from_the_records():
     assert len(published["site/index.html"]) < 1e6 and sum(map(len, published.values())) < 15e6
 
 
-def test_the_same_records_give_the_same_bytes(site):
+def test_the_same_records_give_the_same_bytes(site, rendered):
     assert rendered(list(reversed(several_boards()))) == site
 
 
@@ -102,11 +100,11 @@ def rows_of(html, anchor):
             for row in re.findall(r"<tr.*?>(.*?)</tr>", body)]
 
 
-def test_numbers_are_those_of_the_boards(pages):
+def test_numbers_are_those_of_the_boards(site):
     """Index and environment pages have ranks, errors, skill scores and times of all rows of all leaderboards."""
     for board in collect(several_boards()).boards:
-        shown = rows_of(pages["index.html"], f'id="{board.anchor}"')
-        places = [shown] if board.is_aggregate else [shown, rows_of(pages[board.address], "<h2>Leaderboard</h2>")]
+        shown = rows_of(site["index.html"], f'id="{board.anchor}"')
+        places = [shown] if board.is_aggregate else [shown, rows_of(site[board.address], "<h2>Leaderboard</h2>")]
         for cells_of_rows in places:
             assert len(cells_of_rows) == len(board.rows)
             for cells, row in zip(cells_of_rows, board.rows, strict=True):
@@ -119,11 +117,11 @@ def test_numbers_are_those_of_the_boards(pages):
                     if row.cells[name] is not None:
                         assert format_interval(*row.interval(name)) in " ".join(cells)
                 assert board.is_aggregate or format_number(row.cells["seconds_per_step"]) in cells
-    ranks = [cells[0] for cells in rows_of(pages["environments/eitbench-Pipe2D-v0.html"], "<h2>Leaderboard</h2>")]
+    ranks = [cells[0] for cells in rows_of(site["environments/eitbench-Pipe2D-v0.html"], "<h2>Leaderboard</h2>")]
     assert [rank for rank in ranks if rank.startswith("1")] == ["1 tied", "1 tied"]
 
 
-def test_reference_environments_have_their_tables_on_their_pages_only():
+def test_reference_environments_have_their_tables_on_their_pages_only(rendered):
     """The index names and links them."""
     id = "eitbench/Pipe2DInjection-v0"
     pages = rendered([*several_boards(), record("greedy_a", [0.1, 0.2], id=id, board="injection")])
@@ -132,23 +130,23 @@ def test_reference_environments_have_their_tables_on_their_pages_only():
     assert 'id="board-injection-eitbench-Pipe2DInjection-v0"' not in pages["index.html"]
 
 
-def test_a_methods_page_has_every_episode_and_its_provenance(pages):
+def test_a_methods_page_has_every_episode_and_its_provenance(site, rendered):
     """A method's page has recorded seeds, errors, failures, parameters, commands, and each machine once."""
-    html = pages["methods/failing.html"]
+    html = site["methods/failing.html"]
     assert all(f">test:{i}</td>" in html for i in range(8)) and "RuntimeError: oh" in html and "1 failed" in html
     for episode in next(r for r in several_boards() if r["method"] == "failing")["episodes"][:7]:
         assert f">{format_number(episode['scores']['error'])}</td>" in html
-    text = text_of(pages["methods/b.html"])
+    text = text_of(site["methods/b.html"])
     for expected in ("window = 3", "numpy 2.4.6", "An abacus", "c0ffee", "eitbench run",
                      "eitbench verify leaderboards/results/eitbench-Pipe2D-v0--b--"):
         assert expected in text, expected
-    assert pages["methods/a.html"].count("<h2>Version") == 2
+    assert site["methods/a.html"].count("<h2>Version") == 2
     runs = [RUN | {"machine": RUN["machine"] | {"matmul_seconds": seconds}} for seconds in (0.06, 0.05, 0.055)]
     text = text_of(rendered([record("a", [0.1], runs=runs)])["methods/a.html"])
     assert text.count("An abacus") == 1 and "matrix product 50 to 60 ms" in text
 
 
-def test_docstrings_and_files_are_of_the_recorded_version():
+def test_docstrings_and_files_are_of_the_recorded_version(rendered):
     """A built-in method's description is shown only if the file is unchanged; an agent's file only if it is equal."""
     content = (ROOT / "baselines" / "kalman_filter.py").read_bytes()
     same = record("kalman_filter", [0.1], method_sha256=hashlib.sha256(content).hexdigest())
@@ -164,7 +162,7 @@ def test_docstrings_and_files_are_of_the_recorded_version():
         assert (file in rendered([agent])["methods/maskable_ppo_seed0.html"]) == (digest == ours)
 
 
-def test_agents_of_several_environments_have_no_common_title():
+def test_agents_of_several_environments_have_no_common_title(rendered):
     """Their page has the name as its heading; agents of one environment have a title."""
     one, other = (record("ppo_seed0", of(0.5), id=id, board="injection", title=f"imitation in {id}",
                          parameters={"env": id}) for id in (BUDGET, "eitbench/TankTracking-v0"))
@@ -209,7 +207,7 @@ def board_of(records):
 def test_the_line_of_an_agent_is_the_mean_of_its_trainings():
     """An agent has error, skill score, interval over episodes, and one rank; Markdown has each training seed."""
     board = board_of(agents(record("ppo_seed3", [*of(0.5)[:5], None])))
-    placed = group_by_agent(board)
+    placed = board.grouped()
     assert [row.cells["method"] for row in placed] == ["ppo", "between", "seer", "behind", "homogeneous"]
     row, parts = placed[0], placed[0].trainings
     assert [part.cells["method"] for part in parts] == ["ppo_seed2", "ppo_seed0", "ppo_seed1", "ppo_seed3"]
@@ -236,7 +234,7 @@ def test_the_line_of_an_agent_is_the_mean_of_its_trainings():
 def test_grouped_trainings(records, expected):
     """Records of one agent by the same submitter form a group if two have a rank."""
     board = board_of([record("homogeneous", list(LEVEL), **FLOOR), *records])
-    assert sorted(row.cells["method"] for row in group_by_agent(board)) == sorted([*expected, "homogeneous"])
+    assert sorted(row.cells["method"] for row in board.grouped()) == sorted([*expected, "homogeneous"])
 
 
 def test_an_outperformed_reference_is_marked():
@@ -283,14 +281,14 @@ def test_robustness_by_hand():
     assert shift_heading("me/WeakWorn-v0", "me/Weak-v0") == "worn" and shift_heading(SHORT, HOME) == "short slugs"
 
 
-def test_robustness_is_on_the_site_and_in_the_text(pages):
+def test_robustness_is_on_the_site_and_in_the_text(site, rendered):
     files, text = rendered(shifted()), render(collect(shifted()))["leaderboard.md"]
-    assert f'href="{ROBUSTNESS_PAGE}"' in files["index.html"] and ROBUSTNESS_PAGE not in pages
+    assert 'href="robustness.html"' in files["index.html"] and "robustness.html" not in site
     for id in (SHORT, NOISE):
         name = id.replace("/", "-")
-        assert f'href="environments/{name}.html"' in files[ROBUSTNESS_PAGE]
-        assert f'href="../{ROBUSTNESS_PAGE}"' in files[f"environments/{name}.html"]
-    assert "Slugs pass in half the time" in files[ROBUSTNESS_PAGE]
+        assert f'href="environments/{name}.html"' in files["robustness.html"]
+        assert 'href="../robustness.html"' in files[f"environments/{name}.html"]
+    assert "Slugs pass in half the time" in files["robustness.html"]
     assert "0.3 × 15 (worse than naive)" in text[text.index("## robustness"):]
 
 
@@ -302,7 +300,7 @@ def headlined(errors, official=True, **changes):
                    role="floor" if name == "homogeneous" else None, **changes) for name, error in errors.items()]
 
 
-def test_the_headline_is_computed():
+def test_the_headline_is_computed(rendered):
     """The ratio of 37 and 4 is nine; key figures are skill scores of the best filter, trained agent and rule."""
     found = text_of(rendered(headlined(ERRORS))["index.html"])
     for expected in ("A flow model reduces the error ninefold", "5.0 ×", "error of 0.037", "flow model 0.0040",
@@ -320,7 +318,7 @@ def test_the_headline_is_computed():
 @pytest.mark.parametrize(("errors", "official"), [
     ({name: error for name, error in ERRORS.items() if name != "gauss_newton"}, True),
     (ERRORS | {"gauss_newton": 0.006}, True), (ERRORS | {"gauss_newton": 0.9}, True), (ERRORS, False)])
-def test_no_headline_where_it_would_not_be_true(errors, official):
+def test_no_headline_where_it_would_not_be_true(errors, official, rendered):
     """A missing method, a ratio out of range, or self-reported records give no headline."""
     records = headlined(errors, official)
     assert headline(collect(records)) is None and "<figure>" not in rendered(records)["index.html"]
@@ -329,41 +327,27 @@ def test_no_headline_where_it_would_not_be_true(errors, official):
 # -- links and charts -------------------------------------------------------------------------------------------------
 
 
-def test_every_link_resolves(site, pages):
-    """Links point to files and anchors of the site or the repository; all resources are local."""
-    anchors = {path: Page(html).attributes("id") for path, html in pages.items()}
-    links = 0
-    for path, html in pages.items():
-        parsed = Page(html)
-        for address in parsed.attributes("href") + parsed.attributes("src"):
-            parts = urlsplit(address)
-            assert parts.scheme == "data" or (not parts.scheme and not parts.netloc), address
-            target = normpath(join(dirname(path), unquote(parts.path))) if parts.path else path
-            if parts.scheme or target in ("../leaderboard.csv", "../media/eitbench-Pipe2D-v0.webp"):
-                continue
-            links += 1
-            assert target in site, (path, address)
-            assert not parts.fragment or parts.fragment in anchors[target], (path, address)
-        assert "style=" not in html or not re.search(r"@import|url\(", html)
-        assert set(re.findall(r"var\((--\w+)\)", html)) <= set(re.findall(r"(--\w+):", site["style.css"]))
-    assert links > 50
-
-
-def test_links_to_files_of_the_repository(tmp_path):
-    """Links to files of the repository exist."""
+def test_every_link_resolves(tmp_path, monkeypatch):
+    """Links point to files and anchors of the site or to files around it that exist; all resources are local."""
+    monkeypatch.syspath_prepend(ROOT / "docs")
     folder = tmp_path / "leaderboards"
-    for name in (LINKS["Submit a method"], LINKS["Code"], f"{METHODS_FOLDER}/kalman_filter.py", *(
-            f"media/{name}" for name in HEADLINE)):
+    around = (LINKS["Submit a method"], LINKS["Code"], "../baselines/kalman_filter.py", "leaderboard.csv")
+    for name in (*around, *PICTURES):
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
         (folder / name).write_text("")
-    records = [*headlined(ERRORS), record("kalman_filter", [0.1], version="v1", official=True)]
-    files = render_site(collect(records, folder))
-    for page in ("index.html", "methods/kalman_filter.html"):
-        html = files[page].decode()
-        assert "Submit a method" in html and "Statistics" not in html
-        for address in re.findall(r'(?:href|src|srcset)="((?:\.\./)+(?:README|media|baselines|docs)[^"]*)"', html):
-            assert (folder / "site" / page).parent.joinpath(address).resolve().exists(), address
-    assert 'baselines/kalman_filter.py"' in html
+    files = render_site(collect([*several_boards(), *shifted()[3:], *(
+        record(name, [error] * 8, official=True, version="v1") for name, error in (
+            ("gauss_newton", 0.4), ("extended_kalman_filter", 0.1), ("kalman_filter", 0.1)))], folder))
+    write_site(folder / "site", files)
+    assert importlib.import_module("check_site").problems(folder / "site") == []
+    pages = {path: content.decode() for path, content in files.items() if path.endswith(".html")}
+    for html in pages.values():
+        assert "Submit a method" in html and "Statistics" not in html and 'href="http' not in html
+        assert "style=" not in html or not re.search(r"@import|url\(", html)
+        assert set(re.findall(r"var\((--\w+)\)", html)) <= set(re.findall(r"(--\w+):", files["style.css"].decode()))
+    assert sum(html.count("href=") for html in pages.values()) > 150 and "<figure>" in pages["index.html"]
+    assert 'baselines/kalman_filter.py"' in pages["methods/kalman_filter.html"]
+    assert "media/eitbench-Pipe2D-v0.webp" in pages["environments/eitbench-Pipe2D-v0.html"]
 
 
 def test_markdown_is_text_and_tables():

@@ -215,7 +215,7 @@ def test_the_picture_can_be_stopped(flags, first, tmp_path):
         ("homogeneous", 0.02), ("gauss_newton", 0.037), ("extended_kalman_filter", 0.004))]
     (tmp_path / "media").mkdir()
     for name in HEADLINE:
-        Image.new("RGB", (72, 60), "teal").save(tmp_path / "media" / name)
+        Image.new("RGB", (72, 60), "teal").save(tmp_path / name)
     write_site(tmp_path / "site", render_site(collect(records, tmp_path)))
     before, words, after = answer(tmp_path / "site" / "index.html", """
         const image = one(".hero img"), before = image.currentSrc, words = one(".pause").textContent;

@@ -11,6 +11,7 @@ import ast
 import json
 import re
 from collections.abc import Iterable, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -21,7 +22,7 @@ from eitbench._sanitize import escape_csv
 from eitbench.bench.methods import baseline_folder, builtin_files, builtin_sha256, version_of
 from eitbench.bench.records import finished_at, group_runs, record_file_name, split_outdated
 from eitbench.bench.scores import scores
-from eitbench.bench.table import MISSING, Cell, Table, number_cell
+from eitbench.bench.table import Cell, Table, number_cell
 from eitbench.bench.text import scores_by_seed
 from eitbench.bench.tracks import environment_name, nominal_id, qualified_name
 from eitbench.envs.env_docs import describe_environment
@@ -51,18 +52,13 @@ CATEGORY_TEXTS = {
 }
 """Class -> task."""
 HEADLINE_ENVIRONMENT, AGENT_ENVIRONMENT = "eitbench-Pipe2D-v0", "eitbench-Pipe2DInjectionBudget-v0"
-HEADLINE_METHODS = ("homogeneous", "gauss_newton", "extended_kalman_filter")
 MULTIPLES = dict(enumerate(("two", "three", "four", "five", "six", "seven", "eight", "nine", "ten",
                             "eleven", "twelve"), 2))
-ROBUSTNESS_PAGE, MEASURED_PAGE = "robustness.html", "measured.html"
-HEADLINE = "headline.webp", "headline.png"
-"""Animation of the first page, and its still picture. Others are named like an environment, as in
-eitbench-Pipe2D-v0.webp."""
+HEADLINE = "media/headline.webp", "media/headline.png"
+"""Animation of the first page, and its still picture, from the leaderboards' folder."""
 LINKS = {"Submit a method": "README.md", "Statistics": "../docs/statistics.md",
          "Code": "../README.md"}
 """Link of every page -> file, from the leaderboards' folder."""
-METHODS_FOLDER = "../baselines"
-"""Folder of the built-in methods, from the leaderboards' folder."""
 SITE_MARKER = b"<strong>eitbench</strong> leaderboards"
 """Text by which the index.html of a site is recognised."""
 
@@ -75,10 +71,8 @@ class Site(NamedTuple):
     records: list[dict[str, Any]]
     """Sorted; superseded ones included."""
     measured: measured.MeasuredBoards = measured.EMPTY
-    media: Mapping[str, int] = {}
-    """Name of each picture in the folder ``media`` next to the site -> bytes."""
-    assets: frozenset[str] = frozenset()
-    """Those of `LINKS` and `METHODS_FOLDER` that exist."""
+    folder: Path | None = None
+    """Folder of the leaderboards, which will hold the site; pages link to files around it."""
 
     @property
     def classes(self) -> dict[str, list[Leaderboard]]:
@@ -93,46 +87,44 @@ class Site(NamedTuple):
         return next((board for board in self.boards
                      if (board.category, board.environment) == (category, environment)), None)
 
+    @property
+    def families(self) -> list[robustness.ShiftFamily]:
+        """Nominal environments with their shifted ones."""
+        return robustness.shift_families(self.boards)
+
+    def address(self, name: str, root: str = "") -> str:
+        """Return the address of a file, given by its path from the leaderboards' folder, from a
+        page from which ``root`` leads to the site; empty if the file is missing."""
+        return f"{root}../{name}" if self.folder and (self.folder / name).exists() else ""
+
     def page(self, kind: str, root: str = "", /, **contents: Any) -> bytes:
         """Render a template of the site for a page from which ``root`` leads to the site."""
-        links = {words: f"{root}../{name}" for words, name in LINKS.items() if name in self.assets}
-        return render_template(f"site/{kind}.html.j2", root=root, links=links, **contents)
-
-    def picture(self, name: str, root: str) -> str:
-        """Return the address of a picture; empty if it is missing."""
-        return f"{root}../media/{name}" if name in self.media else ""
+        links = {words: self.address(name, root) for words, name in LINKS.items()}
+        return render_template(f"site/{kind}.html.j2", root=root, links=links, site=self,
+                               tables=tables, robustness=robustness, **contents)
 
 
 def collect(records: Iterable[dict[str, Any]], folder: Path | None = None) -> Site:
-    """Return the site of the records, and of the measured records, pictures and files that it finds
-    in a ``folder`` of leaderboards and in the checkout around it."""
+    """Return the site of the records, and of the measured records in a ``folder`` of leaderboards.
+    """
     ordered = sorted(records, key=lambda record: (
         record["environment"]["name"], record["method"], record["version"]))
-    site = Site(leaderboards(ordered), ordered)
-    if folder is None:
-        return site
-    media = {path.name: path.stat().st_size for path in sorted((folder / "media").glob("*.*"))
-             if path.suffix in (".webp", ".png")}
-    assets = frozenset(name for name in (*LINKS.values(), METHODS_FOLDER)
-                       if (folder / name).exists())
-    return site._replace(measured=measured.MeasuredBoards.of(folder), media=media, assets=assets)
+    found = measured.MeasuredBoards.of(folder) if folder else measured.EMPTY
+    return Site(leaderboards(ordered), ordered, found, folder)
 
 
 def render_site(site: Site) -> dict[str, bytes]:
     """Return all files of the site, by their path within it."""
-    families = robustness.shift_families(site.boards)
     files = {"index.html": index_page(site)}
     for board in site.boards:
         if not board.is_aggregate:
             files[f"environments/{board.environment}.html"] = environment_page(site, board)
     for name in dict.fromkeys(record["method"] for record in site.records):
         files[f"methods/{name}.html"] = method_page(site, name)
-    if families:
-        files[ROBUSTNESS_PAGE] = site.page("robustness", families=families,
-                                      explanations=robustness.ROBUSTNESS_COLUMNS)
+    if site.families:
+        files["robustness.html"] = site.page("robustness")
     if site.measured.records:
-        files[MEASURED_PAGE] = site.page("measured", measured=site.measured,
-                                    explanations=measured.MEASURED_COLUMNS)
+        files["measured.html"] = site.page("measured", explanations=measured.MEASURED_COLUMNS)
     return files | {name: (PACKAGE / "report" / name).read_bytes()
                     for name in ("style.css", "script.js")}
 
@@ -142,11 +134,8 @@ def render(site: Site) -> dict[str, str]:
     `eitbench.bench.load`, and of ``leaderboard.md``, by file name; records of measurement files are
     in the second only."""
     text = render_template(
-        "site/leaderboard.md.j2", families=robustness.shift_families(site.boards),
-        robustness_columns=robustness.ROBUSTNESS_COLUMNS, measured=site.measured,
-        measured_columns=measured.MEASURED_COLUMNS, columns=column_descriptions(),
-        classes={name: [(board, tables.markdown_table(board)) for board in boards]
-                 for name, boards in site.classes.items()},
+        "site/leaderboard.md.j2", site=site, tables=tables, robustness=robustness,
+        measured_columns=measured.MEASURED_COLUMNS, columns=column_descriptions(measured=False),
         superseded=list(map(record_file_name, split_outdated(site.records)[1])))
     table = leaderboard_table(site.boards).replace({"environment": {
         record["environment"]["name"]: qualified_name(record["environment"])
@@ -177,54 +166,33 @@ def write_site(folder: Path, files: Mapping[str, bytes]) -> None:
 
 def index_page(site: Site) -> bytes:
     """Return the HTML of ``index.html``."""
-    apart = reference_environments()
-    shown = {name: [(board, tables.page_table(board, "", compact=True),
-                     tables.score_axes(board)) for board in boards
-                    if board.environment not in apart]
-             for name, boards in site.classes.items()}
-    references = {name: [board for board in boards if board.environment in apart]
-                  for name, boards in site.classes.items()}
+    apart, names = reference_environments(), aggregate_environments()
+    shown = {board.anchor: tables.page_table(board, "", compact=True) for board in site.boards
+             if board.environment not in apart}
+    filters, policies = site.board("filter", ALL), site.board("injection", AGENT_ENVIRONMENT)
+    best = [[row for row in board.grouped() if row.is_ranked] if board else []
+            for board in (filters, policies)]
     return site.page(
-        "index", headline=headline(site), **key_figures(site),
-        moving=site.picture(HEADLINE[0], ""), still=site.picture(HEADLINE[1], ""),
-        n_environments=sum(not board.is_aggregate for board in site.boards),
-        n_records=len(site.records),
-        n_methods=len({record["method"] for record in site.records}), classes=shown,
-        references=references, about=CATEGORY_TEXTS,
-        robustness=ROBUSTNESS_PAGE if robustness.shift_families(site.boards) else "",
-        measured=MEASURED_PAGE if site.measured.records else "",
+        "index", headline=headline(site), filters=filters, policies=policies,
+        best_filters=best[0], best_policies=best[1],
+        n_filter_environments=sum(board.category == "filter" and board.environment in names
+                                  for board in site.boards),
+        moving=site.address(HEADLINE[0]), still=site.address(HEADLINE[1]),
+        shown=shown, about=CATEGORY_TEXTS,
         last=max(map(finished_at, site.records), default="")[:10],
-        explanations=tables.explanations(table for boards in shown.values()
-                                         for _, table, _ in boards))
+        explanations=tables.explanations(shown.values()))
 
 
 def headline(site: Site) -> dict[str, Any] | None:
-    """Return the errors ẽ_c of images with and without a flow model, their ratio in words and the
-    leaderboard; None without official records."""
+    """Return the errors ẽ_c of methods, the ratio of images without and with a flow model in words,
+    and the leaderboard; None without official records."""
     board = site.board("filter", HEADLINE_ENVIRONMENT)
     errors = {row.cells["method"]: row.cells["error"] for row in (board.rows if board else ())
               if row.cells["official"] and row.complete}
-    if board is None or not set(HEADLINE_METHODS) <= errors.keys():
+    if not {"homogeneous", "gauss_newton", "extended_kalman_filter"} <= errors.keys():
         return None
-    homogeneous, stationary, filtered = (errors[name] for name in HEADLINE_METHODS)
-    multiple = MULTIPLES.get(int(stationary / filtered))
-    return {"multiple": multiple, "homogeneous": homogeneous, "stationary": stationary,
-            "filtered": filtered, "board": board} if multiple else None
-
-
-def key_figures(site: Site) -> dict[str, Any]:
-    """Return the aggregate of filters with its best row, and the number of its environments, and
-    the leaderboard of agents with its best agent and its best rule; missing ones are None."""
-    def best(board: Leaderboard | None, *, trained: bool | None = None) -> MethodRow | None:
-        return next((row for row in (tables.group_by_agent(board) if board else ())
-                     if row.is_ranked and trained in (None, bool(row.trainings))), None)
-
-    filters, policies = site.board("filter", ALL), site.board("injection", AGENT_ENVIRONMENT)
-    names = aggregate_environments()
-    return {"filters": filters, "best_filter": best(filters), "policies": policies,
-            "best_agent": best(policies, trained=True), "best_rule": best(policies, trained=False),
-            "n_filter_environments": sum(board.category == "filter" and board.environment in names
-                                         for board in site.boards)}
+    multiple = MULTIPLES.get(int(errors["gauss_newton"] / errors["extended_kalman_filter"]))
+    return {"multiple": multiple, "errors": errors, "board": board} if multiple else None
 
 
 # -- environments ----------------------------------------------------------------------------------
@@ -233,20 +201,15 @@ def key_figures(site: Site) -> dict[str, Any]:
 def environment_page(site: Site, board: Leaderboard) -> bytes:
     """Return the HTML of the page of an environment."""
     id = board.records[0]["environment"]["id"]
-    table = tables.page_table(board, "../")
     description, details = documentation(id)
-    animation = f"{board.environment}.webp"
+    animation = f"media/{board.environment}.webp"
+    moving = site.address(animation, "../")
+    size = (site.folder / animation).stat().st_size if site.folder and moving else 0
+    is_shifted = nominal_id(id) and environment_name(id, {}) == board.environment
     return site.page(
         "environment", "../", board=board, id=id, description=description, details=details,
-        table=table, axes=tables.score_axes(board),
-        explanations=tables.explanations([table]),
-        front=tables.cost_chart(board), curves=tables.curve_chart(board),
-        moving=site.picture(animation, "../"),
-        media_mb=f"{1e-6 * site.media.get(animation, 0):.1f} MB",
-        robustness=(ROBUSTNESS_PAGE
-                    if nominal_id(id) and environment_name(id, {}) == board.environment else ""),
-        siblings=[other for other in site.classes[board.category]
-                  if other is not board and not other.is_aggregate])
+        moving=moving, media_mb=f"{1e-6 * size:.1f} MB",
+        is_shifted=is_shifted)
 
 
 def documentation(id: str) -> tuple[Markup, Markup]:
@@ -265,8 +228,6 @@ def method_page(site: Site, name: str) -> bytes:
                      key=lambda record: (record["official"], finished_at(record)), reverse=True)
     placements = [(board, row) for boards in site.classes.values() for board in boards
                   for row in board.rows if row.cells["method"] == name]
-    addresses = {(row.cells["environment"], row.cells["version"]): board.address
-                 for board, row in placements}
     versions: dict[tuple[str, str], list[dict[str, Any]]] = {}
     for record in records:              # agents of several environments share name and version
         key = record["version"], str(record["parameters"].get("env"))
@@ -276,8 +237,11 @@ def method_page(site: Site, name: str) -> bytes:
     title = name if len({env for _, env in versions}) > 1 else records[0]["title"]
     return site.page(
         "method", "../", name=name, title=title, placements=table, axes=axes,
-        checkout="../../../" if METHODS_FOLDER in site.assets else "",
-        versions=[_version(own, addresses) for own in versions.values()])
+        versions=[(own, *_source(own[0])) for own in versions.values()],
+        addresses={(row.cells["environment"], row.cells["version"]): board.address
+                   for board, row in placements},
+        episode_table=_episodes, environment_title=environment_title, group_runs=group_runs,
+        record_file_name=record_file_name, to_json=partial(json.dumps, ensure_ascii=False))
 
 
 def _placements(placements: list[tuple[Leaderboard, MethodRow]]) -> tuple[Table, dict[str, Axis]]:
@@ -286,41 +250,18 @@ def _placements(placements: list[tuple[Leaderboard, MethodRow]]) -> tuple[Table,
     gains = tables.score_axes(every)["skill score"]
     rows = []
     for board, row in placements:
-        rank = row.cells["rank"]
+        n_ranked = sum(each.is_ranked for each in board.rows)
         link = f"../index.html#{board.anchor}" if board.is_aggregate else f"../{board.address}"
         rows.append({
             "leaderboard": Cell(board.title, board.title.casefold(), link=link,
                           note=f"{board.category} · {row.cells['version']}", badges=row.badges),
-            "rank": Cell(MISSING) if rank is None else Cell(
-                str(rank), float(rank), note=f"of {sum(each.is_ranked for each in board.rows)}"),
+            "rank": number_cell(row.cells["rank"])._replace(
+                note=f"of {n_ranked}" if row.is_ranked else ""),
             "ẽ_c": tables.interval_cell(row, "error", tables.score_axes(board)["ẽ_c"]),
             "skill score": tables.interval_cell(row, "gain", gains),
             "ms/step": number_cell(row.cells["seconds_per_step"])})
     table = Table.of(rows, label="Results", keep=list(rows[0]) if rows else ())
     return table, {"skill score": gains}
-
-
-def _version(records: list[dict[str, Any]], addresses: dict[tuple[str, str], str],
-             ) -> dict[str, Any]:
-    """Return the properties of one version, and its records."""
-    record = records[0]
-    file, docstring = _source(record)
-    shown = []
-    for each in sorted(records, key=lambda record: record["environment"]["name"]):
-        runs = [group[0] | {"products": sorted(1000 * run["machine"]["matmul_seconds"]
-                                               for run in group)}
-                for group in group_runs(each["runs"])]
-        shown.append({
-            "title": environment_title(each), "official": each["official"], "runs": runs,
-            "file": record_file_name(each), "episodes": _episodes(each),
-            "address": addresses.get((each["environment"]["name"], each["version"])),
-            "commands": sorted({run["command"] for run in each["runs"]}),
-            "failures": [episode for episode in each["episodes"] if episode["status"] != "ok"]})
-    return {"name": record["version"], "sha256": record["method_sha256"],
-            "checkpoint": record["checkpoint_sha256"], "file": file, "docstring": docstring,
-            "records": shown,
-            "parameters": {key: json.dumps(value, ensure_ascii=False)
-                           for key, value in sorted(record["parameters"].items())}}
 
 
 def _episodes(record: dict[str, Any]) -> Table:

@@ -52,18 +52,17 @@ class MeasuredBoards(NamedTuple):
             case = read_case(registered_kwargs(id)["case"])
             cases[case.name] = case
             records.setdefault(case.name, []).append(record)
-        for own in records.values():
-            own.sort(key=withheld_rmse)
-        return cls(cases, records, complaints)
+        return cls(cases, {name: sorted(own, key=withheld_rmse) for name, own in records.items()},
+                   complaints)
 
-    def case_table(self, name: str) -> Table:
+    def case_table(self, case: str) -> Table:
         """Return the table of the methods of a case."""
         return Table.of([{
             "method": _method_cell(record, record["title"]),
-            **_score_cell(record, "prediction_error", spread=True), **_score_cell(record, "nis"),
-            **_score_cell(record, "ktc"),
+            **{scores("measured")[name].heading: _score_cell(record, name)
+               for name in ("prediction_error", "nis", "ktc")},
             "ms/step": number_cell(min(scores_by_seed(record, "seconds_per_step").values()))}
-            for record in self.records[name]], label=self.cases[name].title)
+            for record in self.records[case]], label=self.cases[case].title)
 
     def all_cases_table(self) -> Table:
         """Return the table of methods and cases: methods of most cases first, then by their
@@ -99,13 +98,13 @@ def _label(record: dict[str, Any]) -> str:
     return f"{record['method']}@{record['version']}"
 
 
-def _score_cell(record: dict[str, Any], score: str, *, spread: bool = False) -> dict[str, Cell]:
-    """Heading and mean of a score, with the least and the largest value where they matter."""
+def _score_cell(record: dict[str, Any], score: str) -> Cell:
+    """Return the mean of a score; of withheld RMSE also the least and the largest value."""
     values = list(scores_by_seed(record, score).values())
     cell = number_cell(fmean(values) if values else None)
-    if spread:
-        cell = cell._replace(note=f"{format_number(min(values))} to {format_number(max(values))}")
-    return {scores("measured")[score].heading: cell}
+    if score != "prediction_error":
+        return cell
+    return cell._replace(note=f"{format_number(min(values))} to {format_number(max(values))}")
 
 
 def _method_cell(record: dict[str, Any], title: str = "") -> Cell:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Iterable
+from itertools import chain
 from statistics import fmean
 from typing import NamedTuple
 
@@ -50,13 +51,6 @@ class ShiftFamily(NamedTuple):
     """Heading -> board, of those with records, in the order of registration."""
 
     @property
-    def definitions(self) -> dict[str, Markup]:
-        """Heading -> the first paragraph of the description of a shift."""
-        texts = {name: entry(board.records[0]["environment"]["id"]).description
-                 for name, board in self.shifts.items()}
-        return {name: markdown(about.strip().split("\n\n")[0]) for name, about in texts.items()}
-
-    @property
     def table(self) -> Table:
         """Table by decreasing lowest skill score, unfinished methods last."""
         nominal = {row.label: row for row in self.nominal.rows} if self.nominal else {}
@@ -64,20 +58,19 @@ class ShiftFamily(NamedTuple):
                    for name, board in self.shifts.items()}
         floors = {name: _best_naive_error(board) for name, board in self.shifts.items()}
         lines: list[tuple[float, dict[str, Cell | str], str]] = []
-        for label in dict.fromkeys(label for rows in shifted.values() for label in rows):
+        for label in dict.fromkeys(chain(*shifted.values())):
             home = nominal.get(label)
             own = {name: rows[label] for name, rows in shifted.items() if label in rows}
             gains = {name: row.cells["gain"] for name, row in own.items()
                      if row.complete and row.cells["gain"] is not None}
             row = home or next(iter(own.values()))
-            cells: dict[str, Cell | str] = {"method": method_cell(row, "", author_badges(row)),
-                                            "nominal": _error_cell(home)}
-            cells |= {name: _error_cell(own.get(name), home, floors[name]) for name in self.shifts}
             least = min(gains, key=gains.__getitem__) if gains.keys() == shifted.keys() else ""
-            cells["mean skill score"] = number_cell(fmean(gains.values()) if least else None)
-            cells["lowest skill score"] = Cell(format_number(gains[least]), gains[least],
-                                       note=least) if least else Cell(MISSING)
-            lines.append((-gains[least] if least else math.inf, cells, filter_flags(row)))
+            lines.append((-gains[least] if least else math.inf, {
+                "method": method_cell(row, "", author_badges(row)), "nominal": _error_cell(home),
+                **{name: _error_cell(own.get(name), home, floors[name]) for name in self.shifts},
+                "mean skill score": number_cell(fmean(gains.values()) if least else None),
+                "lowest skill score": number_cell(gains.get(least))._replace(note=least),
+            }, filter_flags(row)))
         lines.sort(key=lambda line: line[0])
         return Table.of([cells for _, cells, _ in lines], keep=["nominal"],
                         label=f"{base_environment(self.home)} and its shifts",
@@ -104,6 +97,12 @@ def shift_heading(id: str, home: str) -> str:
     return re.sub(r"(?<=[a-z])(?=[A-Z])", " ", words).lower()
 
 
+def shift_definition(board: Leaderboard) -> Markup:
+    """Return the first paragraph of the description of a shifted environment."""
+    description = entry(board.records[0]["environment"]["id"]).description
+    return markdown(description.strip().split("\n\n")[0])
+
+
 def _best_naive_error(board: Leaderboard) -> float:
     """Return the smallest ẽ_c of the naive baselines, official ones where they exist; else ∞."""
     floors = [row for row in board.rows if "floor" in row.badges and row.complete]
@@ -117,11 +116,10 @@ def _error_cell(row: MethodRow | None, home: MethodRow | None = None,
     if row is None:
         return Cell(MISSING)
     error = row.cells["error"]
-    lacks = [word for word in row.badges if "failed" in word or "missing" in word]
-    if error is None:
-        return Cell(MISSING, badges=tuple(lacks))
-    below = [WORSE_THAN_NAIVE] if "floor" not in row.badges and error > floor else []
+    badges = [word for word in row.badges if "failed" in word or "missing" in word]
+    if error is not None and error > floor and "floor" not in row.badges:
+        badges.insert(0, WORSE_THAN_NAIVE)
     ratio = ""
     if home and home.complete and row.complete and home.cells["error"]:
         ratio = f"× {format_number(error / home.cells['error'])}"
-    return Cell(format_number(error), error, note=ratio, badges=(*below, *lacks))
+    return number_cell(error)._replace(note=ratio, badges=tuple(badges))
