@@ -94,7 +94,7 @@ def simulate_batch(world: World, seeds: Sequence[int], progress: bool = True,
                 wait.tick(steps)
 
         streams = [episode_streams(seed) for seed in seeds]
-        trajectories = world.evolve(streams, truth, tick, steps)
+        trajectories = world.target.evolve(world, streams, truth, tick, steps)
         for trajectory, random in zip(trajectories, streams, strict=True):
             noise = random.noise.standard_normal((world.n_steps, electrodes))[:steps]
             observation = world.true_observation(truth, random.contacts)

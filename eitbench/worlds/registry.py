@@ -42,7 +42,7 @@ class Entry:
     """``namespace/Name-vN``"""
     world: World
     track: str
-    """estimation or injection"""
+    """kind of the actions: estimates of the concentration (estimation), or the next injection"""
     settings: Mapping[str, Any] = field(default_factory=dict)
     """of the environment, JSON-ready; keys from `ID_SETTINGS`"""
     description: str = ""
@@ -50,7 +50,8 @@ class Entry:
     test_seeds: str = "test:0-9"
     """episodes of its leaderboard"""
     nominal: str = ""
-    """id of the nominal environment if this one is shifted: same task, other ground truth"""
+    """id of the nominal environment if this one is shifted: same task, other ground truth. The
+    robustness table compares the two and quotes the first paragraph of ``description``"""
     group: str = "user-defined"
     """one of `GROUPS`"""
     is_starting_point: bool = False
@@ -83,36 +84,12 @@ def register(world: World, id: str, *, track: str = "estimation", description: s
              test_seeds: str = "test:0-9", nominal: str = "", group: str = "user-defined",
              is_starting_point: bool = False, is_reference: bool = False,
              **settings: Any) -> None:
-    """Register a world under an id, for `gymnasium.make` and for runs.
+    """Register a world under an id ``namespace/Name-vN``, for `gymnasium.make` and for runs.
 
-    Parameters
-    ----------
-    world : World
-    id : str
-        ``namespace/Name-vN``. A world with other numbers needs another version.
-    track : "estimation" or "injection"
-        Kind of the actions: estimates of the concentration, or the next injection.
-    description : str
-        Markdown for the environment's page.
-    test_seeds : str
-        Test episodes of its leaderboard.
-    nominal : str
-        For a shifted environment: the registered id with the same task and another ground truth.
-        The robustness table compares the two and quotes the first paragraph of ``description``.
-    group : str
-        One of `GROUPS`, for lists of environments.
-    is_starting_point : bool
-        Recommend this environment to new users in lists.
-    is_reference : bool
-        Show its leaderboard on its page only, and omit it in aggregates.
-    settings
-        ``lag`` and ``assume`` of estimation, ``gate`` and ``inflow`` of injection.
-
-    Raises
-    ------
-    ValueError
-        If the id has another form or belongs to another world, a setting is unknown, or ``nominal``
-        has another task.
+    A world with other numbers needs another version. The arguments are the fields of `Entry`;
+    ``settings`` are ``lag`` and ``assume`` of estimation, ``gate`` and ``inflow`` of injection.
+    ``ValueError`` if the id has another form or belongs to another world, a setting is unknown, or
+    ``nominal`` has another task.
     """
     if not re.fullmatch(r"[\w.-]+/[\w.-]+-v\d+", id):
         raise ValueError(f"id must look like 'namespace/Name-v0', got {id!r}")
@@ -166,17 +143,13 @@ def _add(entry: Entry) -> None:
                      reward_threshold=entry.reward_threshold, kwargs={"name": entry.id})
 
 
-@lru_cache(maxsize=1)
-def _returns() -> list[dict[str, str]]:
-    with RETURNS.open(newline="") as file:
-        return list(csv.DictReader(file))
-
-
+@lru_cache
 def published_returns(id: str) -> list[dict[str, str]]:
     """Return rows of an injection environment with the best random, open-loop, adaptive and trained
     policy: group, policy, mean return over dev:0-31 with the reduced filter, and half the width of
     its 95 % interval."""
-    return [row for row in _returns() if row["environment"] == id]
+    with RETURNS.open(newline="") as file:
+        return [row for row in csv.DictReader(file) if row["environment"] == id]
 
 
 def entries() -> dict[str, Entry]:
@@ -189,14 +162,11 @@ def entry(id: str, variant: str | None = None) -> Entry:
     _check.choice("env", id, _entries)
     if variant is None:
         return _entries[id]
-    variants: dict[str, Entry] = {}
-    for each in _entries.values():
-        if each.nominal == id:
-            variants.setdefault(each.variant, each)
-    if not variants:
+    shifted = [each for each in _entries.values() if each.nominal == id]
+    if not shifted:
         raise ValueError(f"{id} has no variants, got {variant!r}")
-    _check.choice(f"variant of {id}", variant, variants)
-    return variants[variant]
+    _check.choice(f"variant of {id}", variant, [each.variant for each in shifted])
+    return next(each for each in shifted if each.variant == variant)
 
 
 def runtime_entries() -> list[Entry]:

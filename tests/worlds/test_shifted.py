@@ -1,5 +1,7 @@
 """Robustness variants of the thesis' pipe: the task of the nominal environment, and the stated ground truth."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from eitbench.data.episode_cache import build_cached_episode, cycle_voltages
@@ -132,7 +134,9 @@ def test_voltages_are_those_of_electrodes_with_these_contacts():
 
 
 def test_contacts_are_drawn_evenly_and_anew():
-    drawn = np.array([PIPE_2D_OTHER_CONTACTS.instrument.draw_contacts(episode_streams(seed).contacts, 16)
+    truth = SimpleNamespace(observation=SimpleNamespace(cem=SimpleNamespace(contact_impedance=1.0),
+                                                        with_contacts=lambda contacts: contacts))
+    drawn = np.array([PIPE_2D_OTHER_CONTACTS.true_observation(truth, episode_streams(seed).contacts)
                       for seed in range(100)])
     assert drawn.shape == (100, 16) and kstest(drawn.ravel(), "uniform", (0.5, 1.0)).pvalue > 1e-3
     assert len(np.unique(drawn)) == drawn.size

@@ -79,7 +79,7 @@ def test_ball_goes_round_on_an_orbit_of_the_flow():
     In 2 s, or 1 m, the error of the path is at most 1 mm, a twentieth of the ball's radius.
     """
     flow, a = ROTATING.flow.nominal(ROTATING, fine=True), ROTATING.target.radius
-    path = ROTATING.target.path(ROTATING, flow_stream(1))
+    path = ROTATING.target.path(ROTATING, flow_stream(1)).centres
     s, weights = np.polynomial.legendre.leggauss(8)
     angle = 2.0 * np.pi * np.arange(24) / 24
     round_it = np.stack([np.cos(angle), np.sin(angle)], axis=1)
@@ -99,7 +99,7 @@ def test_ball_begins_within_its_range():
     """Initial positions are uniform between the two radii and in angle."""
     one_step = ROTATING.with_changes({"schedule": {"warm_up": 0, "scored_steps": 1}})
     ball = one_step.target
-    starts = np.array([ball.path(one_step, flow_stream(seed))[0] for seed in range(50)])
+    starts = np.array([ball.path(one_step, flow_stream(seed)).centres[0] for seed in range(50)])
     part = np.hypot(*starts.T) / ROTATING.vessel.radius
     low, high = ball.initial_radius_range
     assert low <= part.min() and part.max() <= high
@@ -116,7 +116,7 @@ def test_ball_keeps_its_content_and_lies_on_its_path():
     expected = np.pi * ball.radius**2 * (SHORT.background - ball.concentration)
     np.testing.assert_allclose(missing.sum(axis=1), expected, rtol=0.01)
     centroid = missing @ mesh.points / missing.sum(axis=1)[:, None]
-    path = ball.path(SHORT, flow_stream(7))
+    path = ball.path(SHORT, flow_stream(7)).centres
     np.testing.assert_allclose(centroid, path, atol=2e-4)
     assert np.linalg.norm(path[-1] - path[0]) > 0.01
     assert concentration.min() >= ball.concentration - 1e-4
