@@ -10,7 +10,7 @@ In reduced coordinates, with ĉ = c̄ + B â, G = Bᵀ M̃ B and the projection 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -25,7 +25,6 @@ from eitbench.data.episode_cache import (
     cycle_voltages,
     integrals,
     score_mass,
-    scoring_constants,
 )
 from eitbench.data.episodes import cache_per_truth
 from eitbench.data.presimulation import BATCH_SIZE, presimulate
@@ -256,24 +255,18 @@ def _projected(world: World, entries: np.ndarray) -> tuple[np.ndarray, np.ndarra
 
     Nodes outside a region have the projection over the whole vessel.
     """
-    truth = _solver(world)(entries["moment"].astype(float).T).T
-    scored = integrals(world, entries)
-    moment = scored.moment.astype(float)
-    if world.region is not None:
-        inside, solve = _region_solver(world)
+    truth = np.zeros(entries["moment"].shape)
+    for each in dict.fromkeys((replace(world, region=None), world)):
+        scored = integrals(each, entries)
+        moment = scored.moment.astype(float)
+        inside, solve = _solver(each)
         truth[:, inside] = solve(moment[:, inside].T).T
     unresolved = scored.deviation - np.einsum("tn,tn->t", moment, truth)
     return (world.background + truth).astype(np.float32), unresolved, np.array(scored.square)
 
 
 @cache_per_truth(4)
-def _solver(world: World) -> Any:
-    """Return b (n, T) -> M̃⁻¹ b over the whole vessel."""
-    return splu(_symmetric(scoring_constants(world).mass).tocsc()).solve
-
-
-@cache_per_truth(4)
-def _region_solver(world: World) -> tuple[np.ndarray, Any]:
+def _solver(world: World) -> tuple[np.ndarray, Any]:
     """Return the nodes of the world's region, and a solver with M̃ restricted to them."""
     mass = _symmetric(score_mass(world))
     diagonal = mass.diagonal()

@@ -19,7 +19,7 @@ import numpy as np
 
 from eitbench import _check
 from eitbench._extras import require_extra
-from eitbench.measured.measurements import Measurements
+from eitbench.measured.measurements import Measurements, file_sha256
 from eitbench.measured.readers import load_yaml, read
 from eitbench.measured.segmentation import read_truth
 
@@ -151,13 +151,3 @@ def check_file(path: Path, digest: str, case: str) -> None:
     """Raise ``ValueError`` unless a file or folder exists and has the sha256 of a case."""
     if (actual := file_sha256(path) if path.exists() else "nothing") != digest:
         raise ValueError(f"{path} must have the sha256 {digest} of the case {case}, got {actual}")
-
-
-def file_sha256(path: Path) -> str:
-    """Return the digest of a file, or of all files of a folder in the order of their names."""
-    files = sorted(path.iterdir()) if path.is_dir() else [path]
-    digest = hashlib.sha256()
-    for each in filter(Path.is_file, files):
-        with each.open("rb") as stream:
-            hashlib.file_digest(stream, lambda: digest)
-    return digest.hexdigest()

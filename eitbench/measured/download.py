@@ -6,7 +6,6 @@ import os
 import shutil
 import tempfile
 import zipfile
-from collections.abc import Iterable
 from pathlib import Path
 from urllib.parse import quote
 from urllib.request import urlopen
@@ -45,10 +44,11 @@ def download_case(case: MeasuredCase) -> list[Path]:
                 for name in missing:
                     _download(case.address + quote(Path(name).name), place / name)
             else:
-                archive = place / "archive.zip"
-                _download(case.address, archive)
-                _extract(archive, missing, place)
-        except (OSError, zipfile.BadZipFile) as error:
+                _download(case.address, place / "archive.zip")
+                with zipfile.ZipFile(place / "archive.zip") as archive:
+                    archive.extractall(place)
+                    place /= archive.namelist()[0].partition("/")[0]
+        except (OSError, IndexError, zipfile.BadZipFile) as error:
             raise ValueError(f"case {case.name} could not be downloaded from {case.address}: "
                              f"{error}") from None
         for name, digest in missing.items():
@@ -65,16 +65,3 @@ def _download(address: str, path: Path) -> None:
             reply, "read", total=int(reply.headers.get("Content-Length") or 0), desc=path.name,
             unit_scale=True, disable=None, leave=False) as stream:
         shutil.copyfileobj(stream, file)
-
-
-def _extract(archive: Path, names: Iterable[str], place: Path) -> None:
-    """Extract files and folders by their names below the first folder of an archive."""
-    with zipfile.ZipFile(archive) as content:
-        for member in content.infolist():
-            name = member.filename.partition("/")[2]
-            wanted = any(name == each or Path(each) == Path(name).parent for each in names)
-            if wanted and not member.is_dir():
-                path = place / name
-                path.parent.mkdir(parents=True, exist_ok=True)
-                with content.open(member) as stream, path.open("wb") as file:
-                    shutil.copyfileobj(stream, file)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import re
 import warnings
 from collections.abc import Callable
@@ -16,8 +15,8 @@ import numpy as np
 
 from eitbench import _check
 from eitbench._extras import require_extra
-from eitbench.measured.matlab import load_variables, provenance, read_eidors, read_ktc
-from eitbench.measured.measurements import Measurements
+from eitbench.measured.matlab import load_variables, read_eidors, read_ktc
+from eitbench.measured.measurements import Measurements, provenance
 from eitbench.measured.quality import find_spikes
 
 TIME, LOWEST, HIGHEST, COUNT, AMPLITUDE, MODE = 3, 4, 5, 7, 8, 13
@@ -102,14 +101,11 @@ def read_sciospec(path: Path, *, frequency: float | None = None) -> Measurements
         voltages = _relative_to_mean(voltages.reshape(-1, L), np.tile(np.arange(K), len(files)))
     frame_time = float(np.median(np.diff(starts))) if len(files) > 1 else 1.0
     times = np.subtract(starts, starts[0])[:, None] + frame_time / K * np.arange(K)
-    digest = hashlib.sha256(b"".join(file.read_bytes() for file in files)).hexdigest()
-    # every folder of frames is called setup; its parent's name identifies it
-    name = f"{path.resolve().parent.name}/{path.name}" if path.is_dir() else path.name
     return Measurements(
         _pair_currents(np.array(pairs), amplitude, L), np.tile(np.arange(K), len(files)),
         matrix, voltages.reshape(-1, L), times.ravel(),
-        source={"file": name, "sha256": digest, "frames": len(files), "frequency": hertz,
-                "assumed": "real parts; amplitude in A"})
+        source=provenance(path, frames=len(files), frequency=hertz,
+                          assumed="real parts; amplitude in A"))
 
 
 def _relative_to_mean(potentials: np.ndarray, index: np.ndarray) -> np.ndarray:

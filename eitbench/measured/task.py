@@ -117,7 +117,7 @@ def _with_flow(task: Task, vessel: VesselConfig) -> Task:
         task.mesh, shape.laminar_velocity(flow.mean_velocity), flow.diffusivity,
         task.transport.time_step,
         substeps=shape.substeps(fine=False), inlet=inlet))
-    if not flow.is_estimated:
+    if not flow.velocity_std:
         return task
     assert isinstance(shape, PlanePipe)
     return replace(task, velocity=parabolic_model(shape.half_width, flow.mean_velocity,

@@ -16,8 +16,6 @@ from eitbench.worlds.task import make_task
 from eitbench.worlds.vessels import Bulge, PlanePipe, RoundTank
 from eitbench.worlds.world import World
 
-from tiny_worlds import truths
-
 BUBBLES = entry("eitbench/BubbleTracking-v0").world.with_changes(
     {"vessel": {"truth_refinement": 1}, "schedule": {"scored_steps": 24, "warm_up": 8}})
 LENGTH, R, DT = BUBBLES.vessel.length, BUBBLES.vessel.half_width, BUBBLES.time_step
@@ -67,15 +65,6 @@ def test_bubbles_oscillate_and_wait():
                 assert 1.0 - 1e-6 <= frequency <= 3.0 + 1e-6
     # a wait ends at the next step: half a step longer in the mean
     assert np.mean(waits) == pytest.approx(0.2 + 0.5 * DT, rel=0.1)
-
-
-def test_truth_is_the_bubble_on_its_path():
-    path = BUBBLES.target.path(BUBBLES, episode_streams(3).flow)
-    points = cached_truth_model(BUBBLES).transport.mesh.points
-    (truth,) = truths(BUBBLES, 3)
-    for t in (0, 10, 20, 30):
-        disc = path.present[t] * disc_indicator(points, path.centres[t], path.radius, TRANSITION_WIDTH)
-        np.testing.assert_allclose(truth.concentration[t], 30.0 - 28.5 * disc, rtol=1e-6)
 
 
 def test_truth_has_a_finer_electrode_mesh_on_request():
