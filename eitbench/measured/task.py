@@ -77,11 +77,14 @@ def task_from_measurements(vessel: VesselConfig, calibration: Calibration,
     mesh = vessel.transport_mesh()
     cem = vessel.electrode_model(calibration.contact_impedance)
     background = calibration.conductivity / molar_conductivity
+    mean, model = calibration.mean_voltages, calibration.model_voltages
+    corrects_offset, corrects_gain = (calibration.correction == each for each in ("offset", "gain"))
     observation: Any = MeasurementModel(                # estimators require a `VoltageModel` only
         ObservationModel(cem, mesh.interpolation_to(cem.mesh.points),
                          LinearConductivity(molar_conductivity), 1e-3 * background),
         measurements.currents, calibration.gain * measurements.matrix, vessel.depth,
-        offset=calibration.offset, gain=calibration.channel_gain,
+        offset=np.nan_to_num(mean - model) if corrects_offset else 0.0,
+        gain=np.nan_to_num(mean / model, nan=1.0) if corrects_gain else 1.0,
         mask=available_channels(measurements) if mask is None else mask)
     T, frame = len(measurements.injection_index), measurements.frame_length
     step = float(np.median(np.diff(measurements.times))) if T > 1 else 1.0

@@ -57,17 +57,11 @@ class Body(Target):
             yield TruthTrajectory(states, np.empty((last, 0)))
 
 
-@dataclass(frozen=True)
 class Disc(Body):
     """A rigid disc of low conductivity."""
 
-    background: float = 30.0
-    """mol/m³, about 0.3 S/m: weak saline"""
-    concentration: float = 1.5
-    """mol/m³: a twentieth of the background, because a P1 conductivity has to stay positive"""
-
-    def __post_init__(self) -> None:
-        check_positive(self, background="mol/m³", concentration="mol/m³")
+    concentration: float
+    """mol/m³"""
 
     def path(self, world: World, random: np.random.Generator) -> BodyPath:
         """Draw the path of an episode."""
@@ -88,14 +82,17 @@ class ResistiveDisc(Disc):
     Thesis 7.1, where it is a ball. All numbers [E].
     """
 
+    background: float = 30.0
+    """mol/m³, about 0.3 S/m: weak saline"""
     radius: float = 0.022
     """m"""
+    concentration: float = 1.5
+    """mol/m³: a twentieth of the background, because a P1 conductivity has to stay positive"""
     initial_radius_range: tuple[float, float] = (0.25, 0.48)
     """initial distance from the centre relative to the tank's radius; the angle is uniform"""
 
     def __post_init__(self) -> None:
-        super().__post_init__()
-        check_positive(self, radius="m")
+        check_positive(self, background="mol/m³", radius="m", concentration="mol/m³")
         check_ranges(self, open_low=False, initial_radius_range="")
 
     def check(self, world: World) -> None:
@@ -133,11 +130,15 @@ class ResistiveDisc(Disc):
 class MovingBody(Disc):
     """A resistive disc that moves by itself and may be absent; filters estimate its position."""
 
+    background: float = 30.0
+    """mol/m³, about 0.3 S/m: weak saline"""
     radius_range: tuple[float, float] = (0.014, 0.018)
-    """m, in all of an episode"""
+    """m"""
+    concentration: float = 1.5
+    """mol/m³: a twentieth of the background, because a P1 conductivity has to stay positive"""
 
     def __post_init__(self) -> None:
-        super().__post_init__()
+        check_positive(self, background="mol/m³", concentration="mol/m³")
         check_ranges(self, radius_range="m")
 
     def limits(self, world: World) -> tuple[tuple[float, float], float]:

@@ -163,13 +163,12 @@ class RandomWalkFlow(PipeFlow):
     def draw(self, world: World, random: np.random.Generator) -> Callable[[int], SkewedChannelFlow]:
         low, high = self.velocity_range
         intervals = int((high - low) / self.velocity_walk + 1e-9)
-        start = random.integers(2 * intervals) if intervals else 0
+        period = max(2 * intervals, 1)
+        start = random.integers(period)
         signs = random.choice([-1, 1], world.spin_up_steps + world.n_steps)
         steps = start + np.concatenate([[0], np.cumsum(signs)])[:-1]
         # reflected at the ends
-        folded = np.abs((steps + intervals) % (2 * intervals) - intervals) if intervals \
-            else 0 * steps
-        velocity = low + folded * self.velocity_walk
+        velocity = low + np.abs((steps + intervals) % period - intervals) * self.velocity_walk
 
         def flow(t: int) -> SkewedChannelFlow:
             mean = float(velocity[t + world.spin_up_steps - 1])

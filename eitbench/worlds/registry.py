@@ -118,19 +118,14 @@ def _check_same_task(shifted: Entry) -> None:
     if nominal is None or nominal.nominal:
         raise ValueError("nominal must be a registered id that is not shifted itself, "
                          f"got {shifted.nominal!r}")
-    own, expected = _task_values(shifted), _task_values(nominal)
+    own, expected = ({  # all values that the task specifies apart from the assumed flow
+        "track": each.track, "settings": dict(each.settings), "vessel": each.world.vessel,
+        "schedule": each.world.schedule, "steps": (each.world.n_steps, each.world.warm_up),
+        "noise": each.world.instrument.model_noise, "current": each.world.instrument.current,
+        "prior": each.world.prior} for each in (shifted, nominal))
     if different := [name for name in own if own[name] != expected[name]]:
         raise ValueError(f"nominal must be an id with the same task; {shifted.id} and {nominal.id} "
                          f"differ in {', '.join(different)}")
-
-
-def _task_values(entry: Entry) -> dict[str, Any]:
-    """Return the values that the task specifies, without the assumed flow."""
-    world = entry.world
-    return {"track": entry.track, "settings": dict(entry.settings), "vessel": world.vessel,
-            "schedule": world.schedule, "steps": (world.n_steps, world.warm_up),
-            "noise": world.instrument.model_noise, "current": world.instrument.current,
-            "prior": world.prior}
 
 
 def _add(entry: Entry) -> None:

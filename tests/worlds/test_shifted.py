@@ -88,7 +88,7 @@ def test_short_slugs_last_half_as_long():
 
 
 def test_measurements_have_twice_the_specified_noise():
-    """The fluid is that of the nominal environment; also with a noise floor."""
+    """The fluid is the same as in the nominal environment; also with a noise floor."""
     assert PIPE_2D_DOUBLE_NOISE.truth_config == PIPE_2D.truth_config and PIPE_2D_DOUBLE_NOISE.name == PIPE_2D.name
     here, there = small(SHIFTS[2]), small(NOMINAL_ID)
     assert here.instrument.noise_mismatch == 2.0
