@@ -25,8 +25,6 @@ if TYPE_CHECKING:
 
 PROFILES = ("parabolic", "plug", "power-law")
 """Velocity profiles that a model of a plane pipe may assume."""
-BULGE_FLOW_ASSUMPTIONS = ("parabolic", "real")
-"""Flows that a model of the pipe with a bulge may assume."""
 
 
 @dataclass(frozen=True)
@@ -254,10 +252,10 @@ class FlowPastBulge(PipeFlow):
         return _past_bulge(world.vessel, self, (96, 24) if fine else (64, 16))
 
     def assumed_velocity(self, world: World, **assumed: Any) -> VelocityField:
-        """Accept ``flow``, one of `BULGE_FLOW_ASSUMPTIONS`."""
+        """Accept ``flow``, "parabolic" or "real"."""
         reject_unknown_assumptions(assumed, ("flow",))
         flow = assumed.get("flow", "parabolic")
-        _check.choice("assume.flow", flow, BULGE_FLOW_ASSUMPTIONS)
+        _check.choice("assume.flow", flow, ("parabolic", "real"))
         if flow == "real":
             return self.nominal(world, fine=False)
         return LocalParabola(self.mean_velocity, world.vessel)

@@ -11,8 +11,6 @@ from eitbench import _check
 from eitbench.physics.observation import VoltageNoise
 from eitbench.worlds.fields import ADDED_LATER, check_not_negative, check_positive, check_ranges
 
-CURRENT_NORMS = ("L1", "L2", "Linf")
-"""Norms that may bound the currents."""
 READINGS = ("all", "neighbours")
 """Electrodes whose voltages are measured: all, or the two next to each driven one."""
 
@@ -77,7 +75,7 @@ class Instrument:
         check_not_negative(self, noise_relative="", noise_floor="V", interference="V",
                            noise_mismatch="")
         if self.current_norm is not None:
-            _check.choice("current_norm", self.current_norm, CURRENT_NORMS)
+            _check.choice("current_norm", self.current_norm, ("L1", "L2", "Linf"))
         _check.choice("readings", self.readings, READINGS)
         _check.number("loose_noise", self.loose_noise, low=1.0)
         _check.number("contact_impedance_spread", self.contact_impedance_spread, low=0.0, high=0.95)
@@ -121,13 +119,8 @@ class Instrument:
                 currents: np.ndarray, draws: np.ndarray) -> np.ndarray:
         """Return voltages (B, L) in V, 𝓡 I plus noise: B episodes at one step, or one at steps t.
 
-        Parameters
-        ----------
-        faults : Faults
-            Its arrays (B, L), or (L,) for all.
-        t : int or (B,)
-        transfer_resistance, currents, draws : (B, L, L), (B, L), (B, L)
-            𝓡, the requested currents in A (A/m in 2D), and standard normal numbers.
+        Arguments are `Faults` of arrays (B, L), or (L,) for all; t, or (B,); 𝓡 (B, L, L); the
+        requested currents I (B, L) in A (A/m in 2D); standard normal numbers (B, L).
         """
         broken = np.asarray(t)[..., None] >= faults.open_circuit_from
         flows = ~(broken & (currents != 0.0)).any(axis=1, keepdims=True)

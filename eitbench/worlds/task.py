@@ -94,16 +94,8 @@ class Task:
 
 
 def make_task(world: World, lag: int | str = 0, **assumed: Any) -> Task:
-    """Return the task of a world.
-
-    Parameters
-    ----------
-    world : World
-    lag : int or "all"
-        See `Task`; "all" requests all states after the last measurement.
-    assumed
-        Other assumptions on the flow than the default; see `World.estimator_model`.
-    """
+    """Return the task of a world with a lag in steps; "all" requests all states after the last
+    measurement. ``assumed`` are assumptions on the flow as of `World.estimator_model`."""
     if not isinstance(world, World):
         raise TypeError(f"world must be a World, as of gymnasium.make(id).unwrapped, got {world!r}")
     steps = lag_steps(world, lag)

@@ -79,14 +79,11 @@ def hidden_after_reset(env, **arguments):
 
 
 def test_seeds_draw_the_withheld_measurements(masks_only):
+    """Each reset without a seed withholds other measurements; the same seed gives the same sequence."""
     one, other, repeated = (hidden_after_reset(masks_only, seed=seed) for seed in (1, 2, 1))
     assert (one != other).any()
     np.testing.assert_array_equal(one, repeated)
     np.testing.assert_array_equal(hidden_after_reset(masks_only, seed=200_001), one)         # test:1 is train:1
-
-
-def test_a_reset_without_a_seed_draws_from_the_generator(masks_only):
-    """Each reset withholds other measurements; the same seed gives the same sequence."""
     sequences = []
     for _ in range(2):
         masks_only.reset(seed=7)
