@@ -109,9 +109,9 @@ class MeasuredCase:
         if not path.exists():
             fetch = f"Run `eitbench fetch {self.name}`, s" if self.address else "S"
             raise ValueError(
-                f"{case_id(self.name)} requires the file {path.name} with sha256 "
-                f"{digest}, from {self.source} (licence: {self.licence}). {fetch}ave it as {path}, "
-                f"or set ${FOLDER_VARIABLE} to the folder that has {self.file}")
+                f"case {self.name} requires the file {path.name} with sha256 {digest}, from "
+                f"{self.source} (licence: {self.licence}). {fetch}ave it as {path}, or set "
+                f"${FOLDER_VARIABLE} to the folder that has {self.file}")
         check_file(path, digest, self.name)
 
 
@@ -122,11 +122,6 @@ def measured_folder() -> Path:
         return Path(folder)
     data = os.environ.get("XDG_DATA_HOME") or Path.home() / ".local" / "share"
     return Path(data) / "eitbench" / "measured"
-
-
-def case_id(name: str) -> str:
-    """Return the environment id under which ``import eitbench`` registers a case."""
-    return f"eitbench/Measured-{name}-v0"
 
 
 def read_case(name: Path | str) -> MeasuredCase:

@@ -216,18 +216,17 @@ def read_table(path: Path, *, electrodes: int, current: float, time_step: float 
     else:
         index = np.unique(pairs, axis=0, return_inverse=True)[1].reshape(-1)
         voltages = _relative_to_mean(voltages, index)
-    currents = _pair_currents(pairs, current, L)
-    source = provenance(path, assumed=f"{current:g} A, voltages in {unit:g} V")
     measurements = Measurements.from_sequence(
-        currents[R:], matrix, voltages[R:], time_step * np.arange(len(voltages) - R),
-        source=source)
+        _pair_currents(pairs, current, L), matrix, voltages, time_step * np.arange(len(voltages)),
+        source=provenance(path, assumed=f"{current:g} A, voltages in {unit:g} V"))
     if not R:
         return measurements
-    empty = Measurements.from_sequence(currents[:R], matrix, voltages[:R], np.arange(float(R)))
-    if not np.array_equal(empty.currents, measurements.currents):
+    index = measurements.injection_index
+    if set(index[:R]) != set(index[R:]):
         raise ValueError("reference_rows must be complete frames of the table's injections, got "
                          f"{R}")
-    return replace(measurements, reference=empty.reference_frames(R))
+    return replace(measurements.select(slice(R, None)), times=measurements.times[:-R],
+                   reference=measurements.select(slice(R)).reference_frames(R))
 
 
 def _read_rows(path: Path, L: int, decimal: str,

@@ -115,16 +115,16 @@ def _with_flow(task: Task, vessel: VesselConfig) -> Task:
     """Replace the transport by convection–diffusion, and add the velocity if it is estimated."""
     shape, flow = vessel.shape, vessel.flow
     assert isinstance(shape, PlanePipe | RoundPipe) and flow is not None
-    _, inlet = shape.transport_mesh(fine=False)
-    task = replace(task, transport=ConvectionDiffusion(
+    transport = ConvectionDiffusion(
         task.mesh, shape.laminar_velocity(flow.mean_velocity), flow.diffusivity,
-        task.transport.time_step,
-        substeps=shape.substeps(fine=False), inlet=inlet))
-    if not flow.velocity_std:
-        return task
-    assert isinstance(shape, PlanePipe)
-    return replace(task, velocity=parabolic_model(shape.half_width, flow.mean_velocity,
-                                           flow.velocity_std, flow.velocity_walk))
+        task.transport.time_step, substeps=shape.substeps(fine=False),
+        inlet=shape.transport_mesh(fine=False)[1])
+    velocity = None
+    if flow.velocity_std:
+        assert isinstance(shape, PlanePipe)
+        velocity = parabolic_model(shape.half_width, flow.mean_velocity, flow.velocity_std,
+                                   flow.velocity_walk)
+    return replace(task, transport=transport, velocity=velocity)
 
 
 def maximise_evidence(task: Task, measurements: Measurements, free: list[str],

@@ -205,6 +205,19 @@ def test_tables_of_differences(tmp_path):
         read(table(tmp_path / "a.csv", **DESCRIPTION, readings="volts"))
 
 
+def test_first_rows_may_be_the_reference(tmp_path):
+    path = table(tmp_path / "a.csv", **DESCRIPTION)
+    path.write_text("\n".join([path.read_text()] * 3))
+    expected = VALUES - VALUES.mean(axis=1, keepdims=True)
+    measurements = read(path, reference_rows=16, time_step=0.5)
+    np.testing.assert_allclose(measurements.voltages, expected)
+    np.testing.assert_allclose(measurements.reference, [expected] * 2)
+    np.testing.assert_array_equal(measurements.times, 0.5 * np.arange(8))
+    for rows in (3, 24):
+        with pytest.raises(ValueError, match=f"reference_rows must be complete frames of .* injections, got {rows}"):
+            read(path, reference_rows=rows)
+
+
 def test_file_of_a_vessel_does_not_describe_a_table(tmp_path):
     table(tmp_path / "tank.csv", **DESCRIPTION)
     (tmp_path / "tank.yml").rename(tmp_path / "tank.csv.yml")
