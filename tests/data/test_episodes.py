@@ -1,8 +1,5 @@
 """Episodes: the truth is reproducible to the last bit, and finer than the estimators' model."""
 
-import hashlib
-import subprocess
-import sys
 
 import numpy as np
 import pytest
@@ -13,7 +10,6 @@ from eitbench.data.episodes import Episode, cached_truth_model, simulate
 from eitbench.worlds.catalogue import PIPE_2D
 from eitbench.worlds.random_streams import episode_streams
 
-from short import FAST
 from tiny_worlds import TINY
 
 pytestmark = pytest.mark.usefixtures("place")
@@ -40,19 +36,6 @@ def test_same_bits_in_this_process_from_the_cache_and_side_by_side(episode, monk
     first = simulate(TINY, 7)
     monkeypatch.setattr(episodes, "simulate_batch", None)
     assert bits(simulate(TINY, 7)) == bits(first) == bits(episode)
-
-
-def test_another_process_has_the_same_bits(episode, place):
-    """It leaves a single valid file with the bits made here."""
-    program = ("from eitbench.worlds.catalogue import PIPE_2D\n"
-               "from eitbench.data.episodes import simulate\n"
-               "import hashlib\n"
-               f"episode = simulate(PIPE_2D.with_changes({FAST!r}), 7)\n"
-               "print(hashlib.sha256(b''.join(array.tobytes() for array in episode)).hexdigest())")
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
-    assert done.stdout.strip() == hashlib.sha256(b"".join(array.tobytes() for array in episode)).hexdigest()
-    assert len([path for path in place.rglob("*") if path.is_file()]) == 1
-    assert bits(simulate(TINY, 7)) == bits(episode)
 
 
 def test_no_cache_neither_reads_nor_writes(episode, place):
