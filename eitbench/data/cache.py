@@ -161,8 +161,7 @@ def use_cache_dir(folder: Path) -> Iterator[None]:
 
 
 def folder(world: World) -> Path:
-    """Return the folder of a world's episodes; worlds that differ only in noise and faults of the
-    instrument or in the prior share it."""
+    """Return the folder of a world's episodes, shared by worlds of one `World.truth_config`."""
     return episode_key(world, "").path.parent
 
 

@@ -304,8 +304,7 @@ def region_operators(world: World) -> tuple[sp.csr_array, sp.csr_array]:
 
 
 def mass_between(mesh: Mesh, begin: float, end: float) -> sp.csr_array:
-    """Return the P1 mass matrix (n, n) in m² (m³ in 3D) of the cells with centroids in
-    begin < x < end (m)."""
+    """Return the P1 mass matrix (n, n), m² (m³ in 3D), of cells with centroids in (begin, end)."""
     centroids = mesh.points[mesh.cells][:, :, 0].mean(axis=1)
     inside = (begin < centroids) & (centroids < end)
     cells = mesh.cells[inside]

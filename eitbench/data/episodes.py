@@ -73,6 +73,7 @@ def simulate_batch(world: World, seeds: Sequence[int], progress: bool = True,
     truth = cached_truth_model(world)
     label = f"simulating {world.name}, seed {', '.join(map(str, seeds))}"
     electrodes = truth.observation.cem.n_electrodes
+    spread = world.instrument.contact_impedance_spread
     steps = world.n_steps if last is None else last
     total = (world.spin_up_steps + 2 * steps) * len(seeds)
     wait = SlowTaskNotice(label, total, PRESIMULATE_HINT)
@@ -87,7 +88,10 @@ def simulate_batch(world: World, seeds: Sequence[int], progress: bool = True,
         trajectories = world.target.evolve(world, streams, truth, tick, steps)
         for trajectory, random in zip(trajectories, streams, strict=True):
             noise = random.noise.standard_normal((world.n_steps, electrodes))[:steps]
-            observation = world.true_observation(truth, random.contacts)
+            observation = truth.observation
+            if spread:
+                factor = random.contacts.uniform(1.0 - spread, 1.0 + spread, electrodes)
+                observation = observation.with_contacts(factor * observation.cem.contact_impedance)
             resistance = observation.transfer_resistance(trajectory.concentration[1:])
             tick(steps)
             concentration = trajectory.concentration.astype(np.float32)

@@ -97,8 +97,7 @@ class MeasuredCase:
         return read(path, self.settings.get("format"), None if span is None else slice(*span))
 
     def truth_mask(self) -> np.ndarray | None:
-        """Read the segmentation (256, 256) of the ground truth; None if the case has none.
-        ``ValueError`` as for `measurements`."""
+        """Read the segmentation (256, 256) of the truth, if any; errors as of `measurements`."""
         if self.truth is None:
             return None
         path = measured_folder() / self.truth["file"]
@@ -116,8 +115,7 @@ class MeasuredCase:
 
 
 def measured_folder() -> Path:
-    """Return $EITBENCH_MEASURED, else $XDG_DATA_HOME/eitbench/measured, else
-    ~/.local/share/eitbench/measured."""
+    """Return $EITBENCH_MEASURED, else eitbench/measured in $XDG_DATA_HOME or ~/.local/share."""
     if folder := os.environ.get(FOLDER_VARIABLE):
         return Path(folder)
     data = os.environ.get("XDG_DATA_HOME") or Path.home() / ".local" / "share"

@@ -32,8 +32,7 @@ EIDORS_FRAME_TIMES = {"zc_demo3": 1 / 7, "zc_demo4": 1 / 7, "zc_resp": 1 / 7}
 
 
 def load_variables(path: Path, *required: str) -> dict[str, np.ndarray]:
-    """Load the variables of a .mat file up to version 7; ``ValueError`` names the file, and
-    ``required`` variables that are missing."""
+    """Load a .mat file up to version 7; ``ValueError`` names the file and missing variables."""
     try:
         content = loadmat(path, appendmat=False)
     except (MatReadError, NotImplementedError, OSError, TypeError, ValueError, KeyError,

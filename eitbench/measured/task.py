@@ -185,8 +185,7 @@ def _ar_coefficient(initial: float, walk: float) -> float:
 
 
 class _NegTwoLogEvidence:
-    """Function −2 ln p(some frames) of noise, initial standard deviation and motion, up to a
-    constant."""
+    """Function −2 ln p(some frames) + constant of noise, initial std and motion."""
 
     def __init__(self, task: Task, measurements: Measurements) -> None:
         model: Any = task.observation

@@ -344,8 +344,7 @@ class Cylinders(Body):
 
 def reflect(centres: np.ndarray, velocities: np.ndarray,
             limit: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return centres (..., 2) in m, and their velocities, after reflection at the circle of radius
-    ``limit`` in m."""
+    """Reflect centres (..., 2) in m, and their velocities, at a circle of radius ``limit`` in m."""
     outside = np.hypot(centres[..., 0], centres[..., 1]) > limit
     beyond, outward = centres[outside], velocities[outside]
     centres, velocities = centres.copy(), velocities.copy()

@@ -5,8 +5,7 @@ from __future__ import annotations
 from eitbench import _check
 
 ADDED_LATER = {"later": True}
-"""Metadata of a field that was added later: cache keys omit it at its default, so that earlier keys
-stay valid."""
+"""Metadata of a field that cache keys omit at its default, so that earlier keys stay valid."""
 
 
 def check_positive(part: object, **units: str) -> None:
@@ -22,8 +21,8 @@ def check_not_negative(part: object, **units: str) -> None:
 
 
 def check_ranges(part: object, *, open_low: bool = True, **units: str) -> None:
-    """Raise ``ValueError`` unless these fields, each with its unit, are ranges 0 < low ≤ high, or
-    0 ≤ low ≤ high without ``open_low``."""
+    """Raise ``ValueError`` unless these fields, each with its unit, are ranges low ≤ high of
+    positive numbers; without ``open_low`` they may be 0."""
     for name, unit in units.items():
         given = getattr(part, name)
         low, high = _check.array(name, given, (2,), units=unit)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import json
 import re
 import warnings
 from collections.abc import Mapping
@@ -18,8 +17,6 @@ import gymnasium as gym
 from eitbench import _check
 from eitbench.worlds.world import World
 
-WORLDS_GROUP = "eitbench.worlds"
-"""Entry points of installed packages: modules that call `register` when they are imported."""
 ENV_CLASSES = {
     "estimation": ("eitbench.envs.estimation:EstimationEnv",
                    "eitbench.envs.estimation:EstimationVectorEnv"),
@@ -28,10 +25,9 @@ ENV_CLASSES = {
 """Track -> its environment and its vector environment."""
 ID_SETTINGS = {"estimation": ("lag", "assume"), "injection": ("gate", "inflow")}
 """Track -> arguments of its environment that an id may fix, besides the world."""
+MAX_SETTINGS_BYTES = 10_000
 GROUPS = ("thesis examples", "extensions", "robustness variants", "injection", "user-defined")
 """Groups of ids in lists of environments."""
-RETURNS = Path(__file__).with_name("returns.csv")
-"""Mean returns of policies in the built-in injection environments, made by studies/returns.py."""
 
 
 @dataclass(frozen=True)
@@ -98,10 +94,7 @@ def register(world: World, id: str, *, track: str = "estimation", description: s
     if unknown := sorted(set(settings) - set(ID_SETTINGS[track])):
         raise ValueError(f"settings of the track {track} must be among "
                          f"{', '.join(ID_SETTINGS[track])}; got {', '.join(unknown)}")
-    try:
-        json.dumps(settings, allow_nan=False)
-    except (TypeError, ValueError) as error:
-        raise ValueError(f"settings must be fit for JSON: {error}") from None
+    _check.json_object("settings", settings, MAX_SETTINGS_BYTES)
     entry = Entry(id, world, track, settings, description, test_seeds, nominal, group,
                   is_starting_point, is_reference)
     if entry.nominal:
@@ -142,8 +135,8 @@ def _add(entry: Entry) -> None:
 def published_returns(id: str) -> list[dict[str, str]]:
     """Return rows of an injection environment with the best random, open-loop, adaptive and trained
     policy: group, policy, mean return over dev:0-31 with the reduced filter, and half the width of
-    its 95 % interval."""
-    with RETURNS.open(newline="") as file:
+    its 95 % interval. ``studies/returns.py`` writes them."""
+    with Path(__file__).with_name("returns.csv").open(newline="") as file:
         return [row for row in csv.DictReader(file) if row["environment"] == id]
 
 
@@ -177,8 +170,9 @@ def import_entries(imported: list[Entry]) -> None:
 
 
 def register_installed() -> None:
-    """Register worlds of installed packages; skip a package that fails with a warning."""
-    for point in entry_points(group=WORLDS_GROUP):
+    """Import modules that installed packages name as entry points, and that call `register`; skip a
+    package that fails with a warning."""
+    for point in entry_points(group="eitbench.worlds"):
         try:
             point.load()
         except Exception as error:          # a third-party package must not break this one

@@ -142,10 +142,6 @@ class PlanePipe:
         return CompleteElectrodeModel(self.deform(straight), self.electrodes(straight),
                                       self.contact_impedance)
 
-    def lower_wall(self, x: np.ndarray) -> np.ndarray:
-        """Return y of the lower wall in m at ``x`` in m."""
-        return (0.0 if self.bulge is None else self.bulge(x)) - self.half_width * np.ones_like(x)
-
     def deform(self, mesh: Mesh) -> Mesh:
         """Deform a mesh of the straight pipe to the walls of this pipe."""
         if self.bulge is None:
@@ -153,7 +149,7 @@ class PlanePipe:
         from eitbench.numerics.mesh import Mesh
         x, y = mesh.points.T
         R = self.half_width
-        low = self.lower_wall(x)
+        low = self.bulge(x) - R
         return Mesh(np.stack([x, low + (y + R) * (R - low) / (2.0 * R)], axis=1), mesh.cells)
 
 

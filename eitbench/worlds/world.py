@@ -279,19 +279,6 @@ class World:
         """
         return self._discretise(self.flow.assumed_velocity(self, **assumed), fine=False)
 
-    def true_observation(self, truth: Discretisation,
-                         contacts: np.random.Generator) -> ObservationModel:
-        """Return the observation model of an episode, with its drawn contact impedances.
-
-        ``contacts`` is the unused stream of the episode.
-        """
-        model = truth.observation
-        spread = self.instrument.contact_impedance_spread
-        if spread == 0.0:
-            return model
-        factor = contacts.uniform(1.0 - spread, 1.0 + spread, self.vessel.n_electrodes)
-        return model.with_contacts(factor * model.cem.contact_impedance)
-
     def sample_inflow(self, seed: int) -> np.ndarray:
         """Draw the inflow of an episode, (spin_up_steps + n_steps + 1, n_inlet) in mol/m³, at the
         nodes of the estimators' inlet from the beginning of the spin-up, without a simulation.
