@@ -9,14 +9,14 @@ import pytest
 
 ROOT = Path(__file__).parent.parent
 PACKAGE = ROOT / "eitbench"
-BUDGETS = {"numerics": 1658, "scoring": 121, "physics": 1639, "worlds": 2820, "data": 1520, "estimation": 6378,
-           "measured": 1972, "envs": 1664, "bench": 4869, "report": 2939, "rl": 848, "cli": 1031}
+BUDGETS = {"numerics": 1658, "scoring": 121, "physics": 1639, "worlds": 2647, "data": 1477, "estimation": 6378,
+           "measured": 1916, "envs": 1664, "bench": 4869, "report": 2939, "rl": 848, "cli": 1031}
 """Package (or module) -> lines of Python allowed, blank lines and docstrings included. Each imports only from those
 before it."""
 TOP = 443
 """Lines allowed in the other modules at the top: public names, argument checks, files, messages."""
 BASELINES = 1829
-TESTS = 20_457
+TESTS = 20_258
 MODULES = {".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__"): path
            for path in PACKAGE.rglob("*.py")}
 
