@@ -16,7 +16,7 @@ before it."""
 TOP = 443
 """Lines allowed in the other modules at the top: public names, argument checks, files, messages."""
 BASELINES = 1829
-TESTS = 20_258
+TESTS = 20_257
 MODULES = {".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__"): path
            for path in PACKAGE.rglob("*.py")}
 
