@@ -11,4 +11,5 @@ TINY = PIPE_2D.with_changes(FAST)
 
 def truths(world, *seeds):
     """Simulate the concentrations and velocities of episodes together, without voltages."""
-    return list(world.evolve([episode_streams(seed) for seed in seeds], cached_truth_model(world), lambda _: None))
+    streams = [episode_streams(seed) for seed in seeds]
+    return list(world.target.evolve(world, streams, cached_truth_model(world), lambda _: None, world.n_steps))

@@ -94,8 +94,7 @@ def fetch(
         help="Names of measured cases, such as iirc of eitbench/Measured-iirc-v0, or YAML files.")],
 ) -> None:
     """Download the public measurements of cases, and check their sha256."""
-    from eitbench.measured.cases import measured_folder, read_case
-    from eitbench.measured.download import download_case
+    from eitbench.measured.cases import download_case, measured_folder, read_case
     with options.cli_errors():
         for case in [read_case(name) for name in cases]:
             options.echo(f"{case.name}: {case.title} (licence: {case.licence})")

@@ -96,16 +96,11 @@ def cached(key: Key, build: Callable[[], Arrays], limit: int = 0) -> dict[str, n
     except OSError as error:
         warn_cache_unwritable(key.path.parent, error)
     if limit:
-        _delete_oldest(key, limit)
+        with suppress(OSError):  # another process may delete them at the same time
+            files = key.path.parent.glob(f"{key.name.partition('-')[0]}-*.npy")
+            for old in sorted(files, key=os.path.getmtime)[:-limit]:
+                old.unlink()
     return _fields(_record(built))
-
-
-def _delete_oldest(key: Key, limit: int) -> None:
-    """Delete the oldest files of this kind; another process may delete them at the same time."""
-    with suppress(OSError):
-        files = list(key.path.parent.glob(f"{key.name.partition('-')[0]}-*.npy"))
-        for old in sorted(files, key=os.path.getmtime)[:-limit]:
-            old.unlink()
 
 
 def store(key: Key, arrays: Arrays) -> None:
@@ -166,8 +161,7 @@ def use_cache_dir(folder: Path) -> Iterator[None]:
 
 
 def folder(world: World) -> Path:
-    """Return the folder of a world's episodes; worlds that differ only in noise and faults of the
-    instrument or in the prior share it."""
+    """Return the folder of a world's episodes, shared by worlds of one `World.truth_config`."""
     return episode_key(world, "").path.parent
 
 
@@ -203,13 +197,10 @@ def _digest(configuration: Any) -> str:
 
 def array_digest(*arrays: np.ndarray) -> str:
     """Return a digest of the contents of arrays, for a `model_key`."""
-    digest = hashlib.sha256()
-    for array in arrays:
-        digest.update(npy(array))
-    return digest.hexdigest()
+    return hashlib.sha256(b"".join(map(_npy, arrays))).hexdigest()
 
 
-def npy(array: np.ndarray) -> bytes:
+def _npy(array: np.ndarray) -> bytes:
     """Return an array as the content of a .npy file."""
     content = io.BytesIO()
     np.save(content, array)
@@ -218,7 +209,7 @@ def npy(array: np.ndarray) -> bytes:
 
 def _encode(key: Key, arrays: Arrays) -> bytes:
     """Return the content of a file."""
-    content = npy(_record(arrays))
+    content = _npy(_record(arrays))
     content += bytes(-len(content) % WORD)
     return content + _checksum(key, content)
 
@@ -231,7 +222,7 @@ def _record(arrays: Arrays) -> np.ndarray:
     """Return one record (1,) with a field for each array, in the array's memory order."""
     held = {}
     for name, array in arrays.items():
-        by_columns = array.flags.f_contiguous and not array.flags.c_contiguous
+        by_columns = array.flags.fnc
         held[name + TRANSPOSED * by_columns] = array.T if by_columns else array
     layout = [(name, array.dtype, array.shape) for name, array in held.items()]
     record = np.zeros(1, np.dtype(layout, align=True))

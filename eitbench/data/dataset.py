@@ -10,7 +10,7 @@ In reduced coordinates, with ĉ = c̄ + B â, G = Bᵀ M̃ B and the projection 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -25,7 +25,6 @@ from eitbench.data.episode_cache import (
     cycle_voltages,
     integrals,
     score_mass,
-    scoring_constants,
 )
 from eitbench.data.episodes import cache_per_truth
 from eitbench.data.presimulation import BATCH_SIZE, presimulate
@@ -151,12 +150,8 @@ class Dataset:
     def project(self, basis: np.ndarray, mean: float | np.ndarray | None = None) -> Dataset:
         """Return the same examples in coordinates a, c = mean + basis a, with exact scores.
 
-        Parameters
-        ----------
-        basis : (n, q) array, mol/m³
-            Such as `pod_modes`. ``ValueError`` if its columns are linearly dependent.
-        mean : float or (n,) array, mol/m³
-            Default: the background of the world.
+        ``basis`` (n, q) in mol/m³, such as `pod_modes`, must have linearly independent columns;
+        otherwise ``ValueError``. ``mean`` is a number or (n,) in mol/m³, by default the background.
         """
         n = self.mesh.n_nodes
         basis = _check.array("basis", basis, (n, None), units="mol/m³")
@@ -193,22 +188,13 @@ class Dataset:
 
 def dataset(env: str, seeds: str | Sequence[int], *,
             world: Mapping[str, Any] | None = None) -> Dataset:
-    """Return episodes of an environment as training examples.
+    """Return episodes of a registered environment as training examples; an injection environment
+    uses the injection cycle of its world.
 
-    Parameters
-    ----------
-    env : str
-        A registered id. An injection environment uses the injection cycle of its world.
-    seeds : str or sequence of int
-        Such as ``"train:0-199"``, or integers. Test episodes, on which methods are scored, require
-        the name of their split: ``"test:0-9"``.
-    world : dict, optional
-        Changes of the world's parts; see `World.with_changes`.
-
-    Raises
-    ------
-    ValueError
-        For an unknown environment, number or seed, or a test episode without its split.
+    ``seeds`` are integers, or a text such as ``"train:0-199"``. Test episodes, on which methods are
+    scored, require the name of their split: ``"test:0-9"``. ``world`` changes parts of the world,
+    see `World.with_changes`. ``ValueError`` for an unknown environment, number or seed, or a test
+    episode without its split.
     """
     return Dataset(env, entry(env).world.with_changes(world), resolve_seeds(seeds))
 
@@ -256,24 +242,18 @@ def _projected(world: World, entries: np.ndarray) -> tuple[np.ndarray, np.ndarra
 
     Nodes outside a region have the projection over the whole vessel.
     """
-    truth = _solver(world)(entries["moment"].astype(float).T).T
-    scored = integrals(world, entries)
-    moment = scored.moment.astype(float)
-    if world.region is not None:
-        inside, solve = _region_solver(world)
+    truth = np.zeros(entries["moment"].shape)
+    for each in dict.fromkeys((replace(world, region=None), world)):
+        scored = integrals(each, entries)
+        moment = scored.moment.astype(float)
+        inside, solve = _solver(each)
         truth[:, inside] = solve(moment[:, inside].T).T
     unresolved = scored.deviation - np.einsum("tn,tn->t", moment, truth)
     return (world.background + truth).astype(np.float32), unresolved, np.array(scored.square)
 
 
-@cache_per_truth(4)
-def _solver(world: World) -> Any:
-    """Return b (n, T) -> M̃⁻¹ b over the whole vessel."""
-    return splu(_symmetric(scoring_constants(world).mass).tocsc()).solve
-
-
-@cache_per_truth(4)
-def _region_solver(world: World) -> tuple[np.ndarray, Any]:
+@cache_per_truth
+def _solver(world: World) -> tuple[np.ndarray, Any]:
     """Return the nodes of the world's region, and a solver with M̃ restricted to them."""
     mass = _symmetric(score_mass(world))
     diagonal = mass.diagonal()

@@ -169,7 +169,7 @@ def prefix_file(world: World, needed: int = 0) -> cache.File:
     return cache.File(key, build)
 
 
-@cache_per_truth(4)
+@cache_per_truth
 def _shipped(world: World) -> np.ndarray | None:
     """Return the shipped steps as entries of a cached episode, None if the package has none; their
     integrals are placeholders, since these steps are not scored."""
@@ -243,7 +243,7 @@ def velocity_error(velocity: VelocityModel, parameters: np.ndarray, moment: np.n
 # -- constants of a world --
 
 
-@cache_per_truth(4)
+@cache_per_truth
 def scoring_constants(world: World) -> ScoringConstants:
     """Return the scoring constants of a world, shipped, cached or computed."""
     arrays = cache.cached(*scoring_constants_file(world))
@@ -265,7 +265,7 @@ def scoring_constants_file(world: World) -> cache.File:
     return cache.File(cache.model_key("outline", parts, SCORING_VERSION), build)
 
 
-@cache_per_truth(4)
+@cache_per_truth
 def score_mass(world: World) -> sp.csr_array:
     """Return M̃ (n, n) over the scored region, in the form of `ScoringConstants.mass`."""
     if world.region is None:
@@ -285,7 +285,7 @@ def truth_mesh(world: World) -> Mesh:
     return cached_truth_model(world).transport.mesh
 
 
-@cache_per_truth(2)
+@cache_per_truth
 def score_operators(world: World) -> tuple[sp.csr_array, sp.csr_array]:
     """Return P and M over the whole vessel."""
     from eitbench.numerics.fem import mass_matrix
@@ -294,7 +294,7 @@ def score_operators(world: World) -> tuple[sp.csr_array, sp.csr_array]:
     return model.interpolation_to(truth.points), mass_matrix(truth)
 
 
-@cache_per_truth(2)
+@cache_per_truth
 def region_operators(world: World) -> tuple[sp.csr_array, sp.csr_array]:
     """Return P and M over the scored region."""
     interpolation, mass = score_operators(world)
@@ -304,8 +304,7 @@ def region_operators(world: World) -> tuple[sp.csr_array, sp.csr_array]:
 
 
 def mass_between(mesh: Mesh, begin: float, end: float) -> sp.csr_array:
-    """Return the P1 mass matrix (n, n) in m² (m³ in 3D) of the cells with centroids in
-    begin < x < end (m)."""
+    """Return the P1 mass matrix (n, n), m² (m³ in 3D), of cells with centroids in (begin, end)."""
     centroids = mesh.points[mesh.cells][:, :, 0].mean(axis=1)
     inside = (begin < centroids) & (centroids < end)
     cells = mesh.cells[inside]

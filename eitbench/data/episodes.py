@@ -38,18 +38,11 @@ class Episode(NamedTuple):
 
 
 def simulate(world: World, seed: int, *, cache: bool = True, progress: bool = True) -> Episode:
-    """Return the episode of ``world`` with this seed, from the cache or simulated.
+    """Return the episode of ``world`` with this seed ≥ 0 (see `eitbench.data.seeds`), simulated, or
+    with ``cache`` from the cache folder ($EITBENCH_CACHE, by default in the user's cache folder).
 
-    Parameters
-    ----------
-    world : World
-    seed : int
-        ≥ 0; see `eitbench.data.seeds` for the public ranges.
-    cache : bool
-        Read from and write to the cache folder ($EITBENCH_CACHE, by default in the user's cache
-        folder).
-    progress : bool
-        Show a progress bar, on a terminal only, and report a simulation of over two seconds.
+    With ``progress``, show a progress bar, on a terminal only, and report a simulation of over two
+    seconds.
     """
     seed = _check.integer("seed", seed, low=0)
 
@@ -61,16 +54,13 @@ def simulate(world: World, seed: int, *, cache: bool = True, progress: bool = Tr
     return Episode(**cached(episode_key(world, f"{seed}.truth"), build))
 
 
-def cache_per_truth(size: int) -> Callable[[Callable[[World], Made]], Callable[[World], Made]]:
-    """Cache a function of a world by `World.truth_config`, for ``size`` of them."""
-    def decorate(function: Callable[[World], Made]) -> Callable[[World], Made]:
-        cached_function = lru_cache(maxsize=size)(function)
-        return wraps(cached_function)(lambda world: cached_function(world.truth_config))
-
-    return decorate
+def cache_per_truth(function: Callable[[World], Made]) -> Callable[[World], Made]:
+    """Cache a function of a world by `World.truth_config`, for four of them."""
+    cached_function = lru_cache(maxsize=4)(function)
+    return wraps(cached_function)(lambda world: cached_function(world.truth_config))
 
 
-@cache_per_truth(4)
+@cache_per_truth
 def cached_truth_model(world: World) -> Discretisation:
     """Return ``world.truth_model()``, cached."""
     return world.truth_model()
@@ -83,6 +73,7 @@ def simulate_batch(world: World, seeds: Sequence[int], progress: bool = True,
     truth = cached_truth_model(world)
     label = f"simulating {world.name}, seed {', '.join(map(str, seeds))}"
     electrodes = truth.observation.cem.n_electrodes
+    spread = world.instrument.contact_impedance_spread
     steps = world.n_steps if last is None else last
     total = (world.spin_up_steps + 2 * steps) * len(seeds)
     wait = SlowTaskNotice(label, total, PRESIMULATE_HINT)
@@ -94,10 +85,13 @@ def simulate_batch(world: World, seeds: Sequence[int], progress: bool = True,
                 wait.tick(steps)
 
         streams = [episode_streams(seed) for seed in seeds]
-        trajectories = world.evolve(streams, truth, tick, steps)
+        trajectories = world.target.evolve(world, streams, truth, tick, steps)
         for trajectory, random in zip(trajectories, streams, strict=True):
             noise = random.noise.standard_normal((world.n_steps, electrodes))[:steps]
-            observation = world.true_observation(truth, random.contacts)
+            observation = truth.observation
+            if spread:
+                factor = random.contacts.uniform(1.0 - spread, 1.0 + spread, electrodes)
+                observation = observation.with_contacts(factor * observation.cem.contact_impedance)
             resistance = observation.transfer_resistance(trajectory.concentration[1:])
             tick(steps)
             concentration = trajectory.concentration.astype(np.float32)

@@ -48,17 +48,10 @@ def export(examples: Dataset, folder: Path, format: str = "npz", *, n_jobs: int 
     """Write a file for each example, the mesh, a README and Croissant metadata; return the number
     of new examples.
 
-    The same call resumes after an interruption, and other seeds may be added.
-
-    Parameters
-    ----------
-    examples : Dataset
-    folder : Path
-        New, empty, or of an export of the same world in the same format; otherwise ``ValueError``.
-    format : "npz" or "hdf5"
-        hdf5 needs the extra ``export``; otherwise ``ModuleNotFoundError``.
-    n_jobs, backend
-        Of the simulation; see `eitbench.data.presimulation.presimulate`.
+    The same call resumes after an interruption, and other seeds may be added. ``ValueError`` unless
+    the folder is new, empty, or of an export of the same world in the same format, "npz" or "hdf5";
+    hdf5 needs the extra ``export``, otherwise ``ModuleNotFoundError``. ``n_jobs`` and ``backend``:
+    see `eitbench.data.presimulation.presimulate`.
     """
     _check.choice("format", format, SUFFIXES)
     if examples.basis is not None:

@@ -82,10 +82,10 @@ class EpisodeSampler:
     """Sampler of the episodes of unseeded resets, from the ``split`` train or dev.
 
     It draws from the first ``episodes`` episodes, for dev by default from `DEV_EPISODES`. For
-    training the number grows by default with the resets since the
-    last seeded one, so that training starts before all are simulated: 1 for the first
-    `SINGLE_EPISODE_RESETS` resets, then the largest power of two that is at most 1/8 of the number
-    of resets, from 8 up to `MAX_EPISODES`. Cached episodes have no influence.
+    training the number grows by default with the resets since the last seeded one, so that training
+    starts before all are simulated: 1 for the first `SINGLE_EPISODE_RESETS` resets, then the
+    largest power of two that is at most 1/8 of the number of resets, from 8 up to `MAX_EPISODES`.
+    Cached episodes have no influence.
     """
 
     def __init__(self, episodes: int | None, split: str = "train") -> None:

@@ -56,22 +56,8 @@ class Calibration:
     """(K, M) V of the fitted model"""
     correction: str = "offset"
     """one of `CORRECTIONS`: "offset" subtracts the misfit on homogeneous fluid from measurements,
-    "gain" divides by the ratio `channel_gain`, "none" corrects nothing"""
-
-    @property
-    def offset(self) -> np.ndarray:
-        """(K, M) V to subtract from measurements if the correction is "offset", else 0: the mean
-        approximation error of the model (Kaipio & Somersalo 2005); 0 where no frame has a value."""
-        if self.correction != "offset":
-            return np.zeros_like(self.mean_voltages)
-        return np.nan_to_num(self.mean_voltages - self.model_voltages)
-
-    @property
-    def channel_gain(self) -> np.ndarray:
-        """(K, M) measured / model voltage if the correction is "gain", else 1."""
-        if self.correction != "gain":
-            return np.ones_like(self.mean_voltages)
-        return np.nan_to_num(self.mean_voltages / self.model_voltages, nan=1.0)
+    the mean approximation error of the model (Kaipio & Somersalo 2005); "gain" divides each channel
+    by its ratio of measured and model voltage; "none" corrects nothing"""
 
 
 def calibrate(electrodes: CompleteElectrodeModel, currents: np.ndarray, matrix: np.ndarray,

@@ -9,17 +9,23 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import shutil
+import tempfile
+import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from functools import cached_property
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote
+from urllib.request import urlopen
 
 import numpy as np
+from tqdm import tqdm
 
 from eitbench import _check
 from eitbench._extras import require_extra
-from eitbench.measured.measurements import Measurements
+from eitbench.measured.measurements import Measurements, file_sha256
 from eitbench.measured.readers import load_yaml, read
 from eitbench.measured.segmentation import read_truth
 
@@ -29,6 +35,8 @@ CASE_SCHEMA = Path(__file__).with_name("case_schema.json")
 WITHHELD_FRACTION = 0.1
 """Fraction of the measurements that scores methods."""
 FOLDER_VARIABLE = "EITBENCH_MEASURED"
+TIMEOUT_S = 60.0
+"""Longest time without an answer of the server of a download."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,8 +97,7 @@ class MeasuredCase:
         return read(path, self.settings.get("format"), None if span is None else slice(*span))
 
     def truth_mask(self) -> np.ndarray | None:
-        """Read the segmentation (256, 256) of the ground truth; None if the case has none.
-        ``ValueError`` as for `measurements`."""
+        """Read the segmentation (256, 256) of the truth, if any; errors as of `measurements`."""
         if self.truth is None:
             return None
         path = measured_folder() / self.truth["file"]
@@ -101,24 +108,18 @@ class MeasuredCase:
         if not path.exists():
             fetch = f"Run `eitbench fetch {self.name}`, s" if self.address else "S"
             raise ValueError(
-                f"{case_id(self.name)} requires the file {path.name} with sha256 "
-                f"{digest}, from {self.source} (licence: {self.licence}). {fetch}ave it as {path}, "
-                f"or set ${FOLDER_VARIABLE} to the folder that has {self.file}")
+                f"case {self.name} requires the file {path.name} with sha256 {digest}, from "
+                f"{self.source} (licence: {self.licence}). {fetch}ave it as {path}, or set "
+                f"${FOLDER_VARIABLE} to the folder that has {self.file}")
         check_file(path, digest, self.name)
 
 
 def measured_folder() -> Path:
-    """Return $EITBENCH_MEASURED, else $XDG_DATA_HOME/eitbench/measured, else
-    ~/.local/share/eitbench/measured."""
+    """Return $EITBENCH_MEASURED, else eitbench/measured in $XDG_DATA_HOME or ~/.local/share."""
     if folder := os.environ.get(FOLDER_VARIABLE):
         return Path(folder)
     data = os.environ.get("XDG_DATA_HOME") or Path.home() / ".local" / "share"
     return Path(data) / "eitbench" / "measured"
-
-
-def case_id(name: str) -> str:
-    """Return the environment id under which ``import eitbench`` registers a case."""
-    return f"eitbench/Measured-{name}-v0"
 
 
 def read_case(name: Path | str) -> MeasuredCase:
@@ -153,11 +154,50 @@ def check_file(path: Path, digest: str, case: str) -> None:
         raise ValueError(f"{path} must have the sha256 {digest} of the case {case}, got {actual}")
 
 
-def file_sha256(path: Path) -> str:
-    """Return the digest of a file, or of all files of a folder in the order of their names."""
-    files = sorted(path.iterdir()) if path.is_dir() else [path]
-    digest = hashlib.sha256()
-    for each in filter(Path.is_file, files):
-        with each.open("rb") as stream:
-            hashlib.file_digest(stream, lambda: digest)
-    return digest.hexdigest()
+def download_case(case: MeasuredCase) -> list[Path]:
+    """Download the missing files of a case into `measured_folder` and return their paths.
+
+    All files are checked by their sha256 before the first is moved into place. ``ValueError`` if
+    the case has no address, the download fails, or a file has another sha256.
+    """
+    folder = measured_folder()
+    missing = {}
+    for name, digest in case.files.items():
+        if (folder / name).exists():
+            check_file(folder / name, digest, case.name)
+        else:
+            missing[name] = digest
+    if not missing:
+        return []
+    if not case.address:
+        raise ValueError(f"case {case.name} has no address: save {', '.join(missing)} of "
+                         f"{case.source} in {folder}")
+    folder.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(prefix="download-", dir=folder) as temporary:
+        place = Path(temporary)
+        try:
+            if case.address.endswith("/"):
+                for name in missing:
+                    _download(case.address + quote(Path(name).name), place / name)
+            else:
+                _download(case.address, place / "archive.zip")
+                with zipfile.ZipFile(place / "archive.zip") as archive:
+                    archive.extractall(place)
+                    place /= archive.namelist()[0].partition("/")[0]
+        except (OSError, IndexError, zipfile.BadZipFile) as error:
+            raise ValueError(f"case {case.name} could not be downloaded from {case.address}: "
+                             f"{error}") from None
+        for name, digest in missing.items():
+            check_file(place / name, digest, case.name)
+        for name in missing:
+            (folder / name).parent.mkdir(parents=True, exist_ok=True)
+            os.replace(place / name, folder / name)
+    return [folder / name for name in missing]
+
+
+def _download(address: str, path: Path) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with urlopen(address, timeout=TIMEOUT_S) as reply, path.open("wb") as file, tqdm.wrapattr(
+            reply, "read", total=int(reply.headers.get("Content-Length") or 0), desc=path.name,
+            unit_scale=True, disable=None, leave=False) as stream:
+        shutil.copyfileobj(stream, file)

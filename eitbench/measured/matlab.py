@@ -6,16 +6,14 @@ Hauptmann et al., "Open 2D electrical impedance tomography data archive" (2017).
 
 from __future__ import annotations
 
-import hashlib
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from scipy.io import loadmat
 from scipy.io.matlab import MatReadError
 from scipy.sparse import issparse
 
-from eitbench.measured.measurements import Measurements
+from eitbench.measured.measurements import Measurements, provenance
 
 MILLIAMPERE = 1e-3
 MATLAB_TYPES = {"O": "cell array or object", "U": "character array"}
@@ -34,8 +32,7 @@ EIDORS_FRAME_TIMES = {"zc_demo3": 1 / 7, "zc_demo4": 1 / 7, "zc_resp": 1 / 7}
 
 
 def load_variables(path: Path, *required: str) -> dict[str, np.ndarray]:
-    """Load the variables of a .mat file up to version 7; ``ValueError`` names the file, and
-    ``required`` variables that are missing."""
+    """Load a .mat file up to version 7; ``ValueError`` names the file and missing variables."""
     try:
         content = loadmat(path, appendmat=False)
     except (MatReadError, NotImplementedError, OSError, TypeError, ValueError, KeyError,
@@ -54,11 +51,6 @@ def load_variables(path: Path, *required: str) -> dict[str, np.ndarray]:
             kind = "struct" if value.dtype.names else MATLAB_TYPES.get(value.dtype.kind, "object")
             raise ValueError(f"{path}: {name} must be a numeric array, got a {kind}")
     return variables
-
-
-def provenance(path: Path, **entries: Any) -> dict[str, Any]:
-    """Return the file's name and sha256, and further ``entries``."""
-    return {"file": path.name, "sha256": hashlib.sha256(path.read_bytes()).hexdigest(), **entries}
 
 
 def read_ktc(path: Path) -> Measurements:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -167,6 +168,23 @@ class Measurements:
             return cls(**content, source=source)
         except (OSError, KeyError, ValueError, TypeError) as error:
             raise ValueError(f"{path} must be a file of measurements: {error}") from None
+
+
+def file_sha256(path: Path) -> str:
+    """Return the digest of a file, or of all files of a folder in the order of their names."""
+    files = sorted(path.iterdir()) if path.is_dir() else [path]
+    digest = hashlib.sha256()
+    for each in filter(Path.is_file, files):
+        with each.open("rb") as stream:
+            hashlib.file_digest(stream, lambda: digest)
+    return digest.hexdigest()
+
+
+def provenance(path: Path, **entries: Any) -> dict[str, Any]:
+    """Return the name and sha256 of a file or a folder, and further ``entries``."""
+    # every Sciospec folder of frames is called setup; its parent's name identifies it
+    name = f"{path.resolve().parent.name}/{path.name}" if path.is_dir() else path.name
+    return {"file": name, "sha256": file_sha256(path), **entries}
 
 
 def _read_rows(path: Path, dataset: Any) -> np.ndarray:

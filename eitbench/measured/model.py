@@ -48,8 +48,7 @@ class MeasurementModel:
         return self.observation.cem
 
     def voltages(self, concentration: np.ndarray, currents: np.ndarray) -> np.ndarray:
-        """Predict voltages (J, M) in V for ``concentration`` (n,) in mol/m³ and injections (J, L)
-        in A."""
+        """Predict voltages (J, M) in V for a concentration (n,) in mol/m³, currents (J, L) in A."""
         k = self._injection_index(currents)
         potentials = self.observation.voltages(concentration, currents / self.depth)
         return self.mask[k] * (self.gain[k] * (potentials @ self.matrix.T) + self.offset[k])

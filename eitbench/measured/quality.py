@@ -130,8 +130,7 @@ def _reciprocity_warnings(measurements: Measurements, calibration: Calibration) 
 
 def _order_warnings(measurements: Measurements, calibration: Calibration,
                     electrodes: CompleteElectrodeModel) -> list[str]:
-    """Try other orders of the electrodes in the measurements, and swapped pairs in both
-    measurements and injections."""
+    """Try other orders of electrodes in the measurements, and pairs swapped in injections too."""
     L = electrodes.n_electrodes
     model = electrodes.with_contacts(CONTACT_PRIOR_MEAN * electrode_sizes(electrodes).mean())
     R = model.transfer_resistance(np.ones(model.mesh.n_nodes))

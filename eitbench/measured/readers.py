@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import re
 import warnings
 from collections.abc import Callable
@@ -16,8 +15,8 @@ import numpy as np
 
 from eitbench import _check
 from eitbench._extras import require_extra
-from eitbench.measured.matlab import load_variables, provenance, read_eidors, read_ktc
-from eitbench.measured.measurements import Measurements
+from eitbench.measured.matlab import load_variables, read_eidors, read_ktc
+from eitbench.measured.measurements import Measurements, provenance
 from eitbench.measured.quality import find_spikes
 
 TIME, LOWEST, HIGHEST, COUNT, AMPLITUDE, MODE = 3, 4, 5, 7, 8, 13
@@ -102,14 +101,11 @@ def read_sciospec(path: Path, *, frequency: float | None = None) -> Measurements
         voltages = _relative_to_mean(voltages.reshape(-1, L), np.tile(np.arange(K), len(files)))
     frame_time = float(np.median(np.diff(starts))) if len(files) > 1 else 1.0
     times = np.subtract(starts, starts[0])[:, None] + frame_time / K * np.arange(K)
-    digest = hashlib.sha256(b"".join(file.read_bytes() for file in files)).hexdigest()
-    # every folder of frames is called setup; its parent's name identifies it
-    name = f"{path.resolve().parent.name}/{path.name}" if path.is_dir() else path.name
     return Measurements(
         _pair_currents(np.array(pairs), amplitude, L), np.tile(np.arange(K), len(files)),
         matrix, voltages.reshape(-1, L), times.ravel(),
-        source={"file": name, "sha256": digest, "frames": len(files), "frequency": hertz,
-                "assumed": "real parts; amplitude in A"})
+        source=provenance(path, frames=len(files), frequency=hertz,
+                          assumed="real parts; amplitude in A"))
 
 
 def _relative_to_mean(potentials: np.ndarray, index: np.ndarray) -> np.ndarray:
@@ -220,18 +216,17 @@ def read_table(path: Path, *, electrodes: int, current: float, time_step: float 
     else:
         index = np.unique(pairs, axis=0, return_inverse=True)[1].reshape(-1)
         voltages = _relative_to_mean(voltages, index)
-    currents = _pair_currents(pairs, current, L)
-    source = provenance(path, assumed=f"{current:g} A, voltages in {unit:g} V")
     measurements = Measurements.from_sequence(
-        currents[R:], matrix, voltages[R:], time_step * np.arange(len(voltages) - R),
-        source=source)
+        _pair_currents(pairs, current, L), matrix, voltages, time_step * np.arange(len(voltages)),
+        source=provenance(path, assumed=f"{current:g} A, voltages in {unit:g} V"))
     if not R:
         return measurements
-    empty = Measurements.from_sequence(currents[:R], matrix, voltages[:R], np.arange(float(R)))
-    if not np.array_equal(empty.currents, measurements.currents):
+    index = measurements.injection_index
+    if set(index[:R]) != set(index[R:]):
         raise ValueError("reference_rows must be complete frames of the table's injections, got "
                          f"{R}")
-    return replace(measurements, reference=empty.reference_frames(R))
+    return replace(measurements.select(slice(R, None)), times=measurements.times[:-R],
+                   reference=measurements.select(slice(R)).reference_frames(R))
 
 
 def _read_rows(path: Path, L: int, decimal: str,

@@ -77,11 +77,14 @@ def task_from_measurements(vessel: VesselConfig, calibration: Calibration,
     mesh = vessel.transport_mesh()
     cem = vessel.electrode_model(calibration.contact_impedance)
     background = calibration.conductivity / molar_conductivity
+    mean, model = calibration.mean_voltages, calibration.model_voltages
+    corrects_offset, corrects_gain = (calibration.correction == each for each in ("offset", "gain"))
     observation: Any = MeasurementModel(                # estimators require a `VoltageModel` only
         ObservationModel(cem, mesh.interpolation_to(cem.mesh.points),
                          LinearConductivity(molar_conductivity), 1e-3 * background),
         measurements.currents, calibration.gain * measurements.matrix, vessel.depth,
-        offset=calibration.offset, gain=calibration.channel_gain,
+        offset=np.nan_to_num(mean - model) if corrects_offset else 0.0,
+        gain=np.nan_to_num(mean / model, nan=1.0) if corrects_gain else 1.0,
         mask=available_channels(measurements) if mask is None else mask)
     T, frame = len(measurements.injection_index), measurements.frame_length
     step = float(np.median(np.diff(measurements.times))) if T > 1 else 1.0
@@ -112,16 +115,16 @@ def _with_flow(task: Task, vessel: VesselConfig) -> Task:
     """Replace the transport by convection–diffusion, and add the velocity if it is estimated."""
     shape, flow = vessel.shape, vessel.flow
     assert isinstance(shape, PlanePipe | RoundPipe) and flow is not None
-    _, inlet = shape.transport_mesh(fine=False)
-    task = replace(task, transport=ConvectionDiffusion(
+    transport = ConvectionDiffusion(
         task.mesh, shape.laminar_velocity(flow.mean_velocity), flow.diffusivity,
-        task.transport.time_step,
-        substeps=shape.substeps(fine=False), inlet=inlet))
-    if not flow.is_estimated:
-        return task
-    assert isinstance(shape, PlanePipe)
-    return replace(task, velocity=parabolic_model(shape.half_width, flow.mean_velocity,
-                                           flow.velocity_std, flow.velocity_walk))
+        task.transport.time_step, substeps=shape.substeps(fine=False),
+        inlet=shape.transport_mesh(fine=False)[1])
+    velocity = None
+    if flow.velocity_std:
+        assert isinstance(shape, PlanePipe)
+        velocity = parabolic_model(shape.half_width, flow.mean_velocity, flow.velocity_std,
+                                   flow.velocity_walk)
+    return replace(task, transport=transport, velocity=velocity)
 
 
 def maximise_evidence(task: Task, measurements: Measurements, free: list[str],
@@ -182,8 +185,7 @@ def _ar_coefficient(initial: float, walk: float) -> float:
 
 
 class _NegTwoLogEvidence:
-    """Function −2 ln p(some frames) of noise, initial standard deviation and motion, up to a
-    constant."""
+    """Function −2 ln p(some frames) + constant of noise, initial std and motion."""
 
     def __init__(self, task: Task, measurements: Measurements) -> None:
         model: Any = task.observation

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 from functools import cached_property, lru_cache
@@ -12,9 +11,11 @@ from typing import Any
 import numpy as np
 
 from eitbench import _check
+from eitbench.measured.measurements import file_sha256
 from eitbench.measured.readers import load_yaml
 from eitbench.numerics.mesh import Mesh
 from eitbench.physics.cem import CompleteElectrodeModel
+from eitbench.worlds.fields import check_not_negative, check_positive
 from eitbench.worlds.vessels import MAX_COVERAGE, MeshVessel, PlanePipe, RoundPipe, RoundTank
 
 NUMBERING_DIRECTIONS = ("counter-clockwise", "clockwise")
@@ -44,15 +45,8 @@ class FlowConfig:
     """m/s, standard deviation of the mean velocity's random walk in a step"""
 
     def __post_init__(self) -> None:
-        for name, units in (("mean_velocity", "m/s"), ("diffusivity", "m²/s")):
-            _check.number(f"flow.{name}", getattr(self, name), low=0.0, open_low=True, units=units)
-        for name in ("velocity_std", "velocity_walk"):
-            _check.number(f"flow.{name}", getattr(self, name), low=0.0, units="m/s")
-
-    @property
-    def is_estimated(self) -> bool:
-        """True if the velocity is estimated too."""
-        return self.velocity_std > 0.0
+        check_positive(self, mean_velocity="m/s", diffusivity="m²/s")
+        check_not_negative(self, velocity_std="m/s", velocity_walk="m/s")
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,7 +75,7 @@ class VesselConfig:
         _check.choice("direction", self.direction, NUMBERING_DIRECTIONS)
         if self.conductivity is not None:
             _check.number("conductivity", self.conductivity, low=0.0, open_low=True, units="S/m")
-        if self.flow and self.flow.is_estimated and not isinstance(self.shape, PlanePipe):
+        if self.flow and self.flow.velocity_std and not isinstance(self.shape, PlanePipe):
             raise ValueError("flow.velocity_std must be 0 in a cylinder, whose velocity is not "
                              f"estimated, got {self.flow.velocity_std:g}")
 
@@ -105,8 +99,7 @@ class VesselConfig:
 @lru_cache(maxsize=4)
 def _transport_mesh(shape: Any, first_electrode_deg: float, direction: str) -> Mesh:
     """Build the mesh of the estimates once per process, since priors are cached by mesh."""
-    mesh, _ = shape.transport_mesh(fine=False)
-    return _rotate_mesh(mesh, first_electrode_deg, direction)
+    return _rotate_mesh(shape.transport_mesh(fine=False)[0], first_electrode_deg, direction)
 
 
 def _rotate_mesh(mesh: Mesh, first_electrode_deg: float, direction: str) -> Mesh:
@@ -182,7 +175,7 @@ def _shape(kind: str, entries: dict[str, Any], folder: Path) -> Any:
     path = folder / str(entries["file"])
     if not path.is_file():
         raise ValueError(f"vessel.file must be a mesh file, got {path}")
-    digest = hashlib.sha256(path.read_bytes()).hexdigest()
+    digest = file_sha256(path)
     return MeshVessel(str(path), digest, str(path), digest, count, scale=entries.get("scale", 1.0))
 
 

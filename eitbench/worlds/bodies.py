@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from eitbench import _check
-from eitbench.worlds.fields import check_positive, check_range
+from eitbench.worlds.fields import check_positive, check_ranges
 from eitbench.worlds.world import Discretisation, Target, TruthTrajectory, World
 
 if TYPE_CHECKING:
@@ -26,6 +26,17 @@ DISC_POINTS = np.concatenate([np.zeros((1, 2)), np.sqrt(2 / 3) * np.stack(
 """Quadrature points of the unit disc (Abramowitz & Stegun 25.4.61)."""
 DISC_WEIGHTS = np.array([1 / 4, *[1 / 8] * 6])
 """Quadrature weights, exact for polynomials of degree five."""
+
+
+class BodyPath(NamedTuple):
+    """Path of a body in an episode, t = 0 … T."""
+
+    centres: np.ndarray
+    """(T + 1, 2) m"""
+    present: np.ndarray
+    """(T + 1,) bool: whether the body is in the vessel"""
+    radius: float
+    """m"""
 
 
 class Body(Target):
@@ -46,8 +57,26 @@ class Body(Target):
             yield TruthTrajectory(states, np.empty((last, 0)))
 
 
+class Disc(Body):
+    """A rigid disc of low conductivity."""
+
+    concentration: float
+    """mol/m³"""
+
+    def path(self, world: World, random: np.random.Generator) -> BodyPath:
+        """Draw the path of an episode."""
+        raise NotImplementedError
+
+    def states(self, world: World, points: np.ndarray, random: np.random.Generator,
+               last: int) -> np.ndarray:
+        centres, present, radius = self.path(world, random)
+        disc = np.array([there * disc_indicator(points, centre, radius, TRANSITION_WIDTH)
+                         for centre, there in zip(centres[:last + 1], present, strict=False)])
+        return self.background + (self.concentration - self.background) * disc
+
+
 @dataclass(frozen=True)
-class ResistiveDisc(Body):
+class ResistiveDisc(Disc):
     """A rigid disc of low conductivity that moves with the mean velocity of the flow over its area.
 
     Thesis 7.1, where it is a ball. All numbers [E].
@@ -64,7 +93,7 @@ class ResistiveDisc(Body):
 
     def __post_init__(self) -> None:
         check_positive(self, background="mol/m³", radius="m", concentration="mol/m³")
-        check_range(self, "initial_radius_range", open_low=False)
+        check_ranges(self, open_low=False, initial_radius_range="")
 
     def check(self, world: World) -> None:
         """Raise ``ValueError`` if the disc does not fit into the vessel."""
@@ -72,13 +101,11 @@ class ResistiveDisc(Body):
             raise ValueError("target.initial_radius_range must be a range 0 ≤ low ≤ high that "
                              f"keeps the disc inside the tank, got {self.initial_radius_range!r}")
 
-    def path(self, world: World, random: np.random.Generator) -> np.ndarray:
-        """Return the centres (T + 1, 2) of the disc in m, t = 0 … T."""
+    def path(self, world: World, random: np.random.Generator) -> BodyPath:
         flow = world.flow.nominal(world, fine=True)
         points = self.radius * DISC_POINTS
-        angle = random.uniform(0.0, 2.0 * np.pi)
-        distance = world.vessel.radius * random.uniform(*self.initial_radius_range)
-        centre = distance * np.array([np.cos(angle), np.sin(angle)])
+        direction = _direction(random)
+        centre = world.vessel.radius * random.uniform(*self.initial_radius_range) * direction
         max_distance = world.vessel.radius - self.radius
         dt = world.time_step / PATH_SUBSTEPS
         path = []
@@ -96,47 +123,27 @@ class ResistiveDisc(Body):
             centre = centre + dt / 6.0 * (first + 2.0 * second + 2.0 * third + last)
             # the disc cannot enter the wall
             centre = centre * min(1.0, max_distance / max(np.hypot(*centre), 1e-12))
-        return np.array(path)
-
-    def states(self, world: World, points: np.ndarray, random: np.random.Generator,
-               last: int) -> np.ndarray:
-        disc = np.array([disc_indicator(points, centre, self.radius, TRANSITION_WIDTH)
-                         for centre in self.path(world, random)[:last + 1]])
-        return self.background + (self.concentration - self.background) * disc
+        return BodyPath(np.array(path), np.ones(len(path), dtype=bool), self.radius)
 
 
-class BodyPath(NamedTuple):
-    """Path of a body in an episode, t = 0 … T."""
-
-    centres: np.ndarray
-    """(T + 1, 2) m"""
-    present: np.ndarray
-    """(T + 1,) bool: whether the body is in the vessel"""
-    radius: float
-    """m"""
-
-
-class MovingBody(Body):
+@dataclass(frozen=True)
+class MovingBody(Disc):
     """A resistive disc that moves by itself and may be absent; filters estimate its position."""
 
-    background: float
-    concentration: float
-    radius_range: tuple[float, float]
+    background: float = 30.0
+    """mol/m³, about 0.3 S/m: weak saline"""
+    radius_range: tuple[float, float] = (0.014, 0.018)
+    """m"""
+    concentration: float = 1.5
+    """mol/m³: a twentieth of the background, because a P1 conductivity has to stay positive"""
 
-    def path(self, world: World, random: np.random.Generator) -> BodyPath:
-        """Draw the path of an episode."""
-        raise NotImplementedError
+    def __post_init__(self) -> None:
+        check_positive(self, background="mol/m³", concentration="mol/m³")
+        check_ranges(self, radius_range="m")
 
     def limits(self, world: World) -> tuple[tuple[float, float], float]:
         """Return the largest coordinates in m and the largest speed in m/s, for scaling."""
         raise NotImplementedError
-
-    def states(self, world: World, points: np.ndarray, random: np.random.Generator,
-               last: int) -> np.ndarray:
-        centres, present, radius = self.path(world, random)
-        disc = np.array([there * disc_indicator(points, centre, radius, TRANSITION_WIDTH)
-                         for centre, there in zip(centres[:last + 1], present, strict=False)])
-        return self.background + (self.concentration - self.background) * disc
 
 
 @dataclass(frozen=True)
@@ -147,12 +154,6 @@ class WanderingBody(MovingBody):
     times; the wall reflects it. With visits it disappears at random times and returns anywhere.
     """
 
-    background: float = 30.0
-    """mol/m³, about 0.3 S/m: weak saline"""
-    radius_range: tuple[float, float] = (0.014, 0.018)
-    """m"""
-    concentration: float = 1.5
-    """mol/m³: a twentieth of the background, because a P1 conductivity has to stay positive"""
     speed_range: tuple[float, float] = (0.1, 0.3)
     """m/s"""
     run_time: float = 0.4
@@ -163,10 +164,9 @@ class WanderingBody(MovingBody):
     """s, mean time that it is absent"""
 
     def __post_init__(self) -> None:
-        check_positive(self, background="mol/m³", concentration="mol/m³", run_time="s",
-                       absence_time="s")
-        check_range(self, "radius_range", "m")
-        check_range(self, "speed_range", "m/s")
+        super().__post_init__()
+        check_positive(self, run_time="s", absence_time="s")
+        check_ranges(self, speed_range="m/s")
         if self.visit_time != math.inf:
             check_positive(self, visit_time="s")
 
@@ -215,12 +215,8 @@ class RisingBubble(MovingBody):
     outlet. All numbers [E].
     """
 
-    background: float = 30.0
-    """mol/m³, about 0.3 S/m: weak saline"""
     radius_range: tuple[float, float] = (0.008, 0.012)
     """m, of all bubbles of an episode"""
-    concentration: float = 1.5
-    """mol/m³: a twentieth of the background, because a P1 conductivity has to stay positive"""
     slip_range: tuple[float, float] = (0.05, 0.5)
     """m/s, velocity relative to the flow along the pipe"""
     amplitude_range: tuple[float, float] = (0.0, 0.012)
@@ -231,11 +227,10 @@ class RisingBubble(MovingBody):
     """s, mean of the exponentially distributed times between bubbles"""
 
     def __post_init__(self) -> None:
-        check_positive(self, background="mol/m³", concentration="mol/m³", mean_wait="s")
-        check_range(self, "radius_range", "m")
-        check_range(self, "slip_range", "m/s", open_low=False)
-        check_range(self, "amplitude_range", "m", open_low=False)
-        check_range(self, "frequency_range", "Hz")
+        super().__post_init__()
+        check_positive(self, mean_wait="s")
+        check_ranges(self, frequency_range="Hz")
+        check_ranges(self, open_low=False, slip_range="m/s", amplitude_range="m")
 
     def check(self, world: World) -> None:
         """Raise ``ValueError`` unless the bubbles fit into a straight plane pipe."""
@@ -256,16 +251,16 @@ class RisingBubble(MovingBody):
         radius = random.uniform(*self.radius_range)
         flow = world.flow.nominal(world, fine=True)
         x, wait = random.uniform(radius, vessel.length - radius), 0.0
-        slip, *motion = self._draw(random, vessel.half_width - radius)
+        slip, height = self._draw(random, vessel.half_width - radius)
         centres, present = [], []
         for t in range(world.n_steps + 1):
-            y = self._height(t * world.time_step, *motion)
+            y = height(t * world.time_step)
             centres.append([x, y])
             present.append(wait <= 0.0)
             if wait > 0.0:
                 wait -= world.time_step
                 if wait <= 0.0:
-                    x, (slip, *motion) = radius, self._draw(random, vessel.half_width - radius)
+                    x, (slip, height) = radius, self._draw(random, vessel.half_width - radius)
             else:
                 x += world.time_step * (float(flow(np.array([[x, y]]))[0, 0]) + slip)
                 if x >= vessel.length - radius:
@@ -275,17 +270,16 @@ class RisingBubble(MovingBody):
     def limits(self, world: World) -> tuple[tuple[float, float], float]:
         return (world.vessel.length, world.vessel.half_width), self.slip_range[1]
 
-    def _draw(self, random: np.random.Generator, limit: float) -> tuple[float, ...]:
-        """Draw slip, amplitude, centre, frequency and phase; the bubble stays within ``limit``."""
+    def _draw(self, random: np.random.Generator,
+              limit: float) -> tuple[float, Callable[[float], float]]:
+        """Draw the slip and the height y(time), which stays within ``limit``."""
         amplitude = random.uniform(*self.amplitude_range)
-        return (random.uniform(*self.slip_range), amplitude,
-                (limit - amplitude) * random.uniform(-1.0, 1.0),
-                random.uniform(*self.frequency_range), random.uniform(0.0, 2.0 * math.pi))
-
-    @staticmethod
-    def _height(time: float, amplitude: float, centre: float, frequency: float,
-                phase: float) -> float:
-        return centre + amplitude * math.sin(2.0 * math.pi * frequency * time + phase)
+        slip = random.uniform(*self.slip_range)
+        centre = (limit - amplitude) * random.uniform(-1.0, 1.0)
+        frequency = random.uniform(*self.frequency_range)
+        phase = random.uniform(0.0, 2.0 * math.pi)
+        return slip, lambda time: centre + amplitude * math.sin(2.0 * math.pi * frequency * time
+                                                               + phase)
 
 
 @dataclass(frozen=True)
@@ -310,8 +304,7 @@ class Cylinders(Body):
 
     def __post_init__(self) -> None:
         check_positive(self, background="mol/m³", concentration_ratio="", min_gap="m")
-        check_range(self, "large_radius", "m")
-        check_range(self, "small_radius", "m")
+        check_ranges(self, large_radius="m", small_radius="m")
 
     def check(self, world: World) -> None:
         """Raise ``ValueError`` if the cylinders do not fit into the vessel."""
@@ -351,8 +344,7 @@ class Cylinders(Body):
 
 def reflect(centres: np.ndarray, velocities: np.ndarray,
             limit: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return centres (..., 2) in m, and their velocities, after reflection at the circle of radius
-    ``limit`` in m."""
+    """Reflect centres (..., 2) in m, and their velocities, at a circle of radius ``limit`` in m."""
     outside = np.hypot(centres[..., 0], centres[..., 1]) > limit
     beyond, outward = centres[outside], velocities[outside]
     centres, velocities = centres.copy(), velocities.copy()

@@ -11,11 +11,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from eitbench import _check
-from eitbench.physics.flow import PlaneChannelFlow, PowerLawFlow
+from eitbench.physics.flow import PowerLawFlow
 from eitbench.physics.profiles import SkewedChannelFlow, VelocityModel, parabolic_model
-from eitbench.worlds.fields import check_positive, check_range
+from eitbench.worlds.fields import check_not_negative, check_positive, check_ranges
 from eitbench.worlds.task import make_task
-from eitbench.worlds.vessels import Bulge, PlanePipe
+from eitbench.worlds.vessels import PlanePipe
 from eitbench.worlds.world import Discretisation, Flow, World, reject_unknown_assumptions
 
 if TYPE_CHECKING:
@@ -25,8 +25,6 @@ if TYPE_CHECKING:
 
 PROFILES = ("parabolic", "plug", "power-law")
 """Velocity profiles that a model of a plane pipe may assume."""
-BULGE_FLOW_ASSUMPTIONS = ("parabolic", "real")
-"""Flows that a model of the pipe with a bulge may assume."""
 
 
 @dataclass(frozen=True)
@@ -53,10 +51,8 @@ class PipeFlow(Flow):
                              low=0.0, units="m/s")
         profile = assumed.get("profile") or "parabolic"
         _check.choice("assume.profile", profile, PROFILES)
-        if profile == "plug":
-            return PowerLawFlow(mean, world.vessel.half_width, exponent=0.0)
-        if profile == "power-law":
-            return PowerLawFlow(mean, world.vessel.half_width)
+        if profile != "parabolic":
+            return PowerLawFlow(mean, world.vessel.half_width, 0.0 if profile == "plug" else 1 / 7)
         laminar: VelocityField = world.vessel.laminar_velocity(mean)
         return laminar
 
@@ -94,17 +90,14 @@ class RandomFlow(PipeFlow):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_range(self, "velocity_range", "m/s")
-        check_range(self, "oscillation_range", open_low=False)
-        check_range(self, "period_range", "s")
-        check_range(self, "skewness_range", open_low=False)
+        check_ranges(self, velocity_range="m/s", period_range="s")
+        check_ranges(self, oscillation_range="", skewness_range="", open_low=False)
+        check_not_negative(self, velocity_std="m/s", velocity_walk="m/s")
         if self.oscillation_range[1] >= 1 or self.skewness_range[1] > 5:
             raise ValueError("oscillation_range must lie below 1 and skewness_range below 5, got "
                              f"{self.oscillation_range!r} and {self.skewness_range!r}")
         if self.profiles not in (None, "mean", "three"):
             raise ValueError(f"profiles must be None, 'mean' or 'three', got {self.profiles!r}")
-        _check.number("velocity_std", self.velocity_std, low=0.0, units="m/s")
-        _check.number("velocity_walk", self.velocity_walk, low=0.0, units="m/s")
 
     def spin_up_steps(self, world: World) -> int:
         return transit_steps(world, self.velocity_range[0] * (1.0 - self.oscillation_range[1]))
@@ -155,8 +148,8 @@ class RandomWalkFlow(PipeFlow):
     def __post_init__(self) -> None:
         super().__post_init__()
         check_positive(self, velocity_walk="m/s")
-        _check.number("velocity_std", self.velocity_std, low=0.0, units="m/s")
-        check_range(self, "velocity_range", "m/s")
+        check_not_negative(self, velocity_std="m/s")
+        check_ranges(self, velocity_range="m/s")
 
     def spin_up_steps(self, world: World) -> int:
         return transit_steps(world, self.velocity_range[0])
@@ -168,13 +161,12 @@ class RandomWalkFlow(PipeFlow):
     def draw(self, world: World, random: np.random.Generator) -> Callable[[int], SkewedChannelFlow]:
         low, high = self.velocity_range
         intervals = int((high - low) / self.velocity_walk + 1e-9)
-        start = random.integers(2 * intervals) if intervals else 0
+        period = max(2 * intervals, 1)
+        start = random.integers(period)
         signs = random.choice([-1, 1], world.spin_up_steps + world.n_steps)
         steps = start + np.concatenate([[0], np.cumsum(signs)])[:-1]
         # reflected at the ends
-        folded = np.abs((steps + intervals) % (2 * intervals) - intervals) if intervals \
-            else 0 * steps
-        velocity = low + folded * self.velocity_walk
+        velocity = low + np.abs((steps + intervals) % period - intervals) * self.velocity_walk
 
         def flow(t: int) -> SkewedChannelFlow:
             mean = float(velocity[t + world.spin_up_steps - 1])
@@ -260,13 +252,13 @@ class FlowPastBulge(PipeFlow):
         return _past_bulge(world.vessel, self, (96, 24) if fine else (64, 16))
 
     def assumed_velocity(self, world: World, **assumed: Any) -> VelocityField:
-        """Accept ``flow``, one of `BULGE_FLOW_ASSUMPTIONS`."""
+        """Accept ``flow``, "parabolic" or "real"."""
         reject_unknown_assumptions(assumed, ("flow",))
         flow = assumed.get("flow", "parabolic")
-        _check.choice("assume.flow", flow, BULGE_FLOW_ASSUMPTIONS)
+        _check.choice("assume.flow", flow, ("parabolic", "real"))
         if flow == "real":
             return self.nominal(world, fine=False)
-        return LocalParabola(self.mean_velocity, world.vessel.half_width, world.vessel.bulge)
+        return LocalParabola(self.mean_velocity, world.vessel)
 
     def true_transport(self, world: World, model: Discretisation, random: np.random.Generator,
                        ) -> Callable[[int], Transport]:
@@ -324,20 +316,18 @@ class LocalParabola:
 
     mean_velocity: float
     """v̄ in m/s"""
-    half_width: float
-    """R in m"""
-    bulge: Bulge | None
-    """of the lower wall"""
+    pipe: PlanePipe
 
     def __call__(self, points: np.ndarray) -> np.ndarray:
-        if self.bulge is None:
-            return PlaneChannelFlow(self.mean_velocity, self.half_width)(points)
+        bulge, R = self.pipe.bulge, self.pipe.half_width
+        if bulge is None:
+            return self.pipe.laminar_velocity(self.mean_velocity)(points)
         x, y = np.asarray(points, dtype=float).T
-        bulge = self.bulge(x)
-        slope = -2.0 * (x - self.bulge.position) / self.bulge.width**2 * bulge
-        gap = 2.0 * self.half_width - bulge
-        height = (y + self.half_width - bulge) / gap
-        by_eta = 1.5 * self.mean_velocity * self.half_width * (1.0 - (2.0 * height - 1.0)**2)
+        step = bulge(x)
+        slope = -2.0 * (x - bulge.position) / bulge.width**2 * step
+        gap = 2.0 * R - step
+        height = (y + R - step) / gap
+        by_eta = 1.5 * self.mean_velocity * R * (1.0 - (2.0 * height - 1.0)**2)
         return np.stack([by_eta * 2.0 / gap, by_eta * 2.0 * slope / gap * (1.0 - height)], axis=1)
 
 

@@ -9,10 +9,8 @@ import numpy as np
 
 from eitbench import _check
 from eitbench.physics.observation import VoltageNoise
-from eitbench.worlds.fields import ADDED_LATER, check_positive, check_range
+from eitbench.worlds.fields import ADDED_LATER, check_not_negative, check_positive, check_ranges
 
-CURRENT_NORMS = ("L1", "L2", "Linf")
-"""Norms that may bound the currents."""
 READINGS = ("all", "neighbours")
 """Electrodes whose voltages are measured: all, or the two next to each driven one."""
 
@@ -72,25 +70,20 @@ class Instrument:
     instrument with few voltmeters, whose other voltages are NaN; electrode L − 1 is next to 0"""
 
     def __post_init__(self) -> None:
-        check_positive(self, current="A")
-        # a voltage can be 0: without this part estimators would divide by zero
-        _check.number("noise_relative_to_max", self.noise_relative_to_max, low=0.0, open_low=True)
-        for name, units in (("noise_relative", ""), ("noise_floor", "V"), ("interference", "V")):
-            _check.number(name, getattr(self, name), low=0.0, units=units)
+        # a voltage can be 0: without noise_relative_to_max estimators would divide by zero
+        check_positive(self, current="A", noise_relative_to_max="")
+        check_not_negative(self, noise_relative="", noise_floor="V", interference="V",
+                           noise_mismatch="")
         if self.current_norm is not None:
-            _check.choice("current_norm", self.current_norm, CURRENT_NORMS)
+            _check.choice("current_norm", self.current_norm, ("L1", "L2", "Linf"))
         _check.choice("readings", self.readings, READINGS)
         _check.number("loose_noise", self.loose_noise, low=1.0)
-        _check.number("noise_mismatch", self.noise_mismatch, low=0.0)
         _check.number("contact_impedance_spread", self.contact_impedance_spread, low=0.0, high=0.95)
+        check_ranges(self, open_low=False, n_dead_range="", n_failing_range="", n_loose_range="",
+                     loose_resistance="Ω")
         for name in ("n_dead_range", "n_failing_range", "n_loose_range"):
-            bounds = getattr(self, name)
-            if not isinstance(bounds, (tuple, list)) or len(bounds) != 2:
-                raise ValueError(f"{name} must be a range (least, most), got {bounds!r}")
-            low, high = (_check.integer(name, value, low=0) for value in bounds)
-            if low > high:
-                raise ValueError(f"{name} must be a range least ≤ most, got {bounds!r}")
-        check_range(self, "loose_resistance", "Ω", open_low=False)
+            for value in getattr(self, name):
+                _check.integer(name, value, low=0)
 
     @property
     def max_faulty(self) -> int:
@@ -122,22 +115,12 @@ class Instrument:
         factor[shaky] = self.loose_noise
         return Faults(broken, resistance, factor)
 
-    def draw_contacts(self, random: np.random.Generator, n_electrodes: int) -> np.ndarray:
-        """Draw contact impedances (L,) of an episode relative to the value in the task."""
-        spread = self.contact_impedance_spread
-        return random.uniform(1.0 - spread, 1.0 + spread, n_electrodes)
-
     def measure(self, faults: Faults, t: np.ndarray | int, transfer_resistance: np.ndarray,
                 currents: np.ndarray, draws: np.ndarray) -> np.ndarray:
         """Return voltages (B, L) in V, 𝓡 I plus noise: B episodes at one step, or one at steps t.
 
-        Parameters
-        ----------
-        faults : Faults
-            Its arrays (B, L), or (L,) for all.
-        t : int or (B,)
-        transfer_resistance, currents, draws : (B, L, L), (B, L), (B, L)
-            𝓡, the requested currents in A (A/m in 2D), and standard normal numbers.
+        Arguments are `Faults` of arrays (B, L), or (L,) for all; t, or (B,); 𝓡 (B, L, L); the
+        requested currents I (B, L) in A (A/m in 2D); standard normal numbers (B, L).
         """
         broken = np.asarray(t)[..., None] >= faults.open_circuit_from
         flows = ~(broken & (currents != 0.0)).any(axis=1, keepdims=True)

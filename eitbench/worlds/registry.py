@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import json
 import re
 import warnings
 from collections.abc import Mapping
@@ -18,8 +17,6 @@ import gymnasium as gym
 from eitbench import _check
 from eitbench.worlds.world import World
 
-WORLDS_GROUP = "eitbench.worlds"
-"""Entry points of installed packages: modules that call `register` when they are imported."""
 ENV_CLASSES = {
     "estimation": ("eitbench.envs.estimation:EstimationEnv",
                    "eitbench.envs.estimation:EstimationVectorEnv"),
@@ -28,10 +25,9 @@ ENV_CLASSES = {
 """Track -> its environment and its vector environment."""
 ID_SETTINGS = {"estimation": ("lag", "assume"), "injection": ("gate", "inflow")}
 """Track -> arguments of its environment that an id may fix, besides the world."""
+MAX_SETTINGS_BYTES = 10_000
 GROUPS = ("thesis examples", "extensions", "robustness variants", "injection", "user-defined")
 """Groups of ids in lists of environments."""
-RETURNS = Path(__file__).with_name("returns.csv")
-"""Mean returns of policies in the built-in injection environments, made by studies/returns.py."""
 
 
 @dataclass(frozen=True)
@@ -42,7 +38,7 @@ class Entry:
     """``namespace/Name-vN``"""
     world: World
     track: str
-    """estimation or injection"""
+    """kind of the actions: estimates of the concentration (estimation), or the next injection"""
     settings: Mapping[str, Any] = field(default_factory=dict)
     """of the environment, JSON-ready; keys from `ID_SETTINGS`"""
     description: str = ""
@@ -50,7 +46,8 @@ class Entry:
     test_seeds: str = "test:0-9"
     """episodes of its leaderboard"""
     nominal: str = ""
-    """id of the nominal environment if this one is shifted: same task, other ground truth"""
+    """id of the nominal environment if this one is shifted: same task, other ground truth. The
+    robustness table compares the two and quotes the first paragraph of ``description``"""
     group: str = "user-defined"
     """one of `GROUPS`"""
     is_starting_point: bool = False
@@ -66,13 +63,6 @@ class Entry:
         words = re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "-", name.removeprefix(nominal))
         return words.lower() if nominal else ""
 
-    @property
-    def reward_threshold(self) -> float | None:
-        """Mean return of the best hand-written policy in `published_returns`."""
-        returns = [float(row["mean"]) for row in published_returns(self.id)
-                   if row["group"] in ("open loop", "adaptive")]
-        return max(returns, default=None)
-
 
 _entries: dict[str, Entry] = {}
 _runtime_ids: set[str] = set()
@@ -83,36 +73,12 @@ def register(world: World, id: str, *, track: str = "estimation", description: s
              test_seeds: str = "test:0-9", nominal: str = "", group: str = "user-defined",
              is_starting_point: bool = False, is_reference: bool = False,
              **settings: Any) -> None:
-    """Register a world under an id, for `gymnasium.make` and for runs.
+    """Register a world under an id ``namespace/Name-vN``, for `gymnasium.make` and for runs.
 
-    Parameters
-    ----------
-    world : World
-    id : str
-        ``namespace/Name-vN``. A world with other numbers needs another version.
-    track : "estimation" or "injection"
-        Kind of the actions: estimates of the concentration, or the next injection.
-    description : str
-        Markdown for the environment's page.
-    test_seeds : str
-        Test episodes of its leaderboard.
-    nominal : str
-        For a shifted environment: the registered id with the same task and another ground truth.
-        The robustness table compares the two and quotes the first paragraph of ``description``.
-    group : str
-        One of `GROUPS`, for lists of environments.
-    is_starting_point : bool
-        Recommend this environment to new users in lists.
-    is_reference : bool
-        Show its leaderboard on its page only, and omit it in aggregates.
-    settings
-        ``lag`` and ``assume`` of estimation, ``gate`` and ``inflow`` of injection.
-
-    Raises
-    ------
-    ValueError
-        If the id has another form or belongs to another world, a setting is unknown, or ``nominal``
-        has another task.
+    A world with other numbers needs another version. The arguments are the fields of `Entry`;
+    ``settings`` are ``lag`` and ``assume`` of estimation, ``gate`` and ``inflow`` of injection.
+    ``ValueError`` if the id has another form or belongs to another world, a setting is unknown, or
+    ``nominal`` has another task.
     """
     if not re.fullmatch(r"[\w.-]+/[\w.-]+-v\d+", id):
         raise ValueError(f"id must look like 'namespace/Name-v0', got {id!r}")
@@ -121,10 +87,7 @@ def register(world: World, id: str, *, track: str = "estimation", description: s
     if unknown := sorted(set(settings) - set(ID_SETTINGS[track])):
         raise ValueError(f"settings of the track {track} must be among "
                          f"{', '.join(ID_SETTINGS[track])}; got {', '.join(unknown)}")
-    try:
-        json.dumps(settings, allow_nan=False)
-    except (TypeError, ValueError) as error:
-        raise ValueError(f"settings must be fit for JSON: {error}") from None
+    _check.json_object("settings", settings, MAX_SETTINGS_BYTES)
     entry = Entry(id, world, track, settings, description, test_seeds, nominal, group,
                   is_starting_point, is_reference)
     if entry.nominal:
@@ -141,19 +104,14 @@ def _check_same_task(shifted: Entry) -> None:
     if nominal is None or nominal.nominal:
         raise ValueError("nominal must be a registered id that is not shifted itself, "
                          f"got {shifted.nominal!r}")
-    own, expected = _task_values(shifted), _task_values(nominal)
+    own, expected = ({  # all values that the task specifies apart from the assumed flow
+        "track": each.track, "settings": dict(each.settings), "vessel": each.world.vessel,
+        "schedule": each.world.schedule, "steps": (each.world.n_steps, each.world.warm_up),
+        "noise": each.world.instrument.model_noise, "current": each.world.instrument.current,
+        "prior": each.world.prior} for each in (shifted, nominal))
     if different := [name for name in own if own[name] != expected[name]]:
         raise ValueError(f"nominal must be an id with the same task; {shifted.id} and {nominal.id} "
                          f"differ in {', '.join(different)}")
-
-
-def _task_values(entry: Entry) -> dict[str, Any]:
-    """Return the values that the task specifies, without the assumed flow."""
-    world = entry.world
-    return {"track": entry.track, "settings": dict(entry.settings), "vessel": world.vessel,
-            "schedule": world.schedule, "steps": (world.n_steps, world.warm_up),
-            "noise": world.instrument.model_noise, "current": world.instrument.current,
-            "prior": world.prior}
 
 
 def _add(entry: Entry) -> None:
@@ -162,21 +120,19 @@ def _add(entry: Entry) -> None:
     _runtime_ids.add(entry.id)
     if entry.id not in gym.registry:
         single, vector = ENV_CLASSES[entry.track]
+        returns = [float(row["mean"]) for row in published_returns(entry.id)
+                   if row["group"] in ("open loop", "adaptive")]      # of hand-written policies
         gym.register(entry.id, entry_point=single, vector_entry_point=vector,
-                     reward_threshold=entry.reward_threshold, kwargs={"name": entry.id})
+                     reward_threshold=max(returns, default=None), kwargs={"name": entry.id})
 
 
-@lru_cache(maxsize=1)
-def _returns() -> list[dict[str, str]]:
-    with RETURNS.open(newline="") as file:
-        return list(csv.DictReader(file))
-
-
+@lru_cache
 def published_returns(id: str) -> list[dict[str, str]]:
     """Return rows of an injection environment with the best random, open-loop, adaptive and trained
     policy: group, policy, mean return over dev:0-31 with the reduced filter, and half the width of
-    its 95 % interval."""
-    return [row for row in _returns() if row["environment"] == id]
+    its 95 % interval. ``studies/returns.py`` writes them."""
+    with Path(__file__).with_name("returns.csv").open(newline="") as file:
+        return [row for row in csv.DictReader(file) if row["environment"] == id]
 
 
 def entries() -> dict[str, Entry]:
@@ -189,14 +145,11 @@ def entry(id: str, variant: str | None = None) -> Entry:
     _check.choice("env", id, _entries)
     if variant is None:
         return _entries[id]
-    variants: dict[str, Entry] = {}
-    for each in _entries.values():
-        if each.nominal == id:
-            variants.setdefault(each.variant, each)
-    if not variants:
+    shifted = [each for each in _entries.values() if each.nominal == id]
+    if not shifted:
         raise ValueError(f"{id} has no variants, got {variant!r}")
-    _check.choice(f"variant of {id}", variant, variants)
-    return variants[variant]
+    _check.choice(f"variant of {id}", variant, [each.variant for each in shifted])
+    return next(each for each in shifted if each.variant == variant)
 
 
 def runtime_entries() -> list[Entry]:
@@ -212,8 +165,9 @@ def import_entries(imported: list[Entry]) -> None:
 
 
 def register_installed() -> None:
-    """Register worlds of installed packages; skip a package that fails with a warning."""
-    for point in entry_points(group=WORLDS_GROUP):
+    """Import modules that installed packages name as entry points, and that call `register`; skip a
+    package that fails with a warning."""
+    for point in entry_points(group="eitbench.worlds"):
         try:
             point.load()
         except Exception as error:          # a third-party package must not break this one

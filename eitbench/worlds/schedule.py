@@ -22,19 +22,24 @@ class Pattern(Protocol):
 
 
 @dataclass(frozen=True)
-class OppositeDiagonalPattern:
-    """Alternating opposite and diagonal pairs of a plane pipe; diagonals span three electrodes.
-
-    Successive injections are far apart, so that each section of the pipe is measured before the
-    fluid has left it [E]. Electrodes 0 … L/2−1 are on the lower wall, L/2 … L−1 on the upper
-    wall, both in flow direction.
-    """
+class PipePattern:
+    """A cycle of one frame in a pipe."""
 
     frame: int = 16
     """injections a frame [T]"""
 
     def __post_init__(self) -> None:
         _check.integer("frame", self.frame, low=1)
+
+
+@dataclass(frozen=True)
+class OppositeDiagonalPattern(PipePattern):
+    """Alternating opposite and diagonal pairs of a plane pipe; diagonals span three electrodes.
+
+    Successive injections are far apart, so that each section of the pipe is measured before the
+    fluid has left it [E]. Electrodes 0 … L/2−1 are on the lower wall, L/2 … L−1 on the upper
+    wall, both in flow direction.
+    """
 
     def __call__(self, vessel: PlanePipe) -> np.ndarray:
         per_wall = vessel.electrodes_per_wall
@@ -45,18 +50,12 @@ class OppositeDiagonalPattern:
 
 
 @dataclass(frozen=True)
-class RotatingRingPattern:
+class RotatingRingPattern(PipePattern):
     """Opposite pairs within a ring of a round pipe, alternating with pairs into the next ring.
 
     The rings alternate, and the angle advances by three positions each time [E]. Electrode
     number = ring·(electrodes per ring) + position in the ring.
     """
-
-    frame: int = 16
-    """injections a frame [T]"""
-
-    def __post_init__(self) -> None:
-        _check.integer("frame", self.frame, low=1)
 
     def __call__(self, vessel: RoundPipe) -> np.ndarray:
         per_ring, rings = vessel.electrodes_per_ring, vessel.electrode_rings

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
-from eitbench.worlds.fields import ADDED_LATER, check_positive, check_range
+from eitbench.worlds.fields import ADDED_LATER, check_positive, check_ranges
 from eitbench.worlds.world import Discretisation, Target, TruthTrajectory, World
 
 if TYPE_CHECKING:
@@ -91,10 +91,8 @@ class Slugs(Target):
 
     def __post_init__(self) -> None:
         check_positive(self, background="mol/m³")
-        check_range(self, "log_amplitude")
-        check_range(self, "time_std", "s")
-        check_range(self, "transverse_std", "m")
-        check_range(self, "radial_range", open_low=False)
+        check_ranges(self, log_amplitude="", time_std="s", transverse_std="m")
+        check_ranges(self, open_low=False, radial_range="")
         if not 0 < self.radial_range[1] <= 1:
             raise ValueError("radial_range must end above 0 and at most at 1, at the wall, "
                              f"got {self.radial_range!r}")
@@ -120,40 +118,29 @@ class Slugs(Target):
 
     def evolve(self, world: World, episodes: Sequence[EpisodeStreams], truth: Discretisation,
                tick: Callable[[int], object], last: int) -> Iterator[TruthTrajectory]:
-        if getattr(world.flow, "is_unsteady", False):
-            yield from self._evolve_unsteady(world, episodes, truth, tick, last)
-            return
-        flows = [world.flow.draw(world, episode.flow) for episode in episodes]
         inflows = [self.draw_inflow(world, episode.inflow) for episode in episodes]
-        if flows[0] is None:  # all episodes have the same flow
-            for concentration in advect(world, lambda t, k: truth.transport, inflows, tick, last):
-                yield TruthTrajectory(concentration, np.empty((last, 0)))
-            return
+        is_unsteady = getattr(world.flow, "is_unsteady", False)     # changes within a time step
+        parts, model = world.vessel.n_truth_steps, world.velocity_model
 
         @lru_cache(maxsize=MAX_CACHED_MODELS)
-        def transport(velocity: object) -> Transport:
+        def with_velocity(velocity: object) -> Transport:
             return truth.transport.with_velocity(velocity)  # type: ignore[attr-defined]
 
-        model = world.velocity_model
-        points = np.empty(0) if model is None else model.points
-        for flow, inflow in zip(flows, inflows, strict=True):
-            assert flow is not None
-            (concentration,) = advect(world, lambda t, k: transport(flow(t)),  # noqa: B023
-                                      [inflow], tick, last)
-            velocity = np.array([flow(t).profile(points) for t in range(1, last + 1)])
+        for episode, inflow in zip(episodes, inflows, strict=True):
+            flow = (world.flow.true_transport(world, truth, episode.flow) if is_unsteady
+                    else world.flow.draw(world, episode.flow))
+            if flow is None:  # all episodes have the same flow
+                for concentration in advect(world, lambda t, k: truth.transport, inflows, tick,
+                                            last):
+                    yield TruthTrajectory(concentration, np.empty((last, 0)))
+                return
+            (concentration,) = advect(
+                world, lambda t, k: (flow(t + k / parts) if is_unsteady  # noqa: B023
+                                     else with_velocity(flow(t))),  # noqa: B023
+                [inflow], tick, last)
+            velocity = np.empty((last, 0)) if model is None else np.array(
+                [flow(t).profile(model.points) for t in range(1, last + 1)])
             yield TruthTrajectory(concentration, velocity)
-
-    def _evolve_unsteady(self, world: World, episodes: Sequence[EpisodeStreams],
-                         truth: Discretisation, tick: Callable[[int], object],
-                         last: int) -> Iterator[TruthTrajectory]:
-        """Simulate episodes in flows that change within a time step."""
-        parts = world.vessel.n_truth_steps
-        for episode in episodes:
-            transport = world.flow.true_transport(world, truth, episode.flow)
-            inflow = self.draw_inflow(world, episode.inflow)
-            (concentration,) = advect(world, lambda t, k: transport(t + k / parts),  # noqa: B023
-                                      [inflow], tick, last)
-            yield TruthTrajectory(concentration, np.empty((last, 0)))
 
 
 def advect(world: World, transport_at: Callable[[int, int], Transport], inflows: Sequence[Inflow],

@@ -36,8 +36,7 @@ MEMBERS = {
 
 
 def stored_names(kind: type) -> dict[str, str]:
-    """Return the name in stored keys of each field of a dataclass; fields that third-party classes
-    define keep their names."""
+    """Return the name in stored keys of each field; third-party classes' fields keep theirs."""
     builtin = {each.name for base in kind.__mro__ if is_builtin(base) and is_dataclass(base)
                for each in fields(base)}
     return {each.name: STORED_NAMES.get(each.name, each.name) if each.name in builtin else each.name

@@ -1,4 +1,7 @@
-"""Vessels: plane and round pipes, flat round tanks, and any shape from mesh files."""
+"""Vessels: plane and round pipes, flat round tanks, and any shape from mesh files.
+
+Methods import finite elements, which cached episodes do not need.
+"""
 
 from __future__ import annotations
 
@@ -122,7 +125,6 @@ class PlanePipe:
 
     def transport_mesh(self, fine: bool) -> tuple[Mesh, np.ndarray]:
         """Return a mesh of 10,251 nodes for the truth or 1,701 for the model, and its inlet."""
-        # finite elements: cached episodes do not need them
         from eitbench.numerics.mesh import rectangle_mesh
         along, across = (200, 50) if fine else (80, 20)
         mesh = rectangle_mesh(np.linspace(0.0, self.length, along + 1),
@@ -140,10 +142,6 @@ class PlanePipe:
         return CompleteElectrodeModel(self.deform(straight), self.electrodes(straight),
                                       self.contact_impedance)
 
-    def lower_wall(self, x: np.ndarray) -> np.ndarray:
-        """Return y of the lower wall in m at ``x`` in m."""
-        return (0.0 if self.bulge is None else self.bulge(x)) - self.half_width * np.ones_like(x)
-
     def deform(self, mesh: Mesh) -> Mesh:
         """Deform a mesh of the straight pipe to the walls of this pipe."""
         if self.bulge is None:
@@ -151,7 +149,7 @@ class PlanePipe:
         from eitbench.numerics.mesh import Mesh
         x, y = mesh.points.T
         R = self.half_width
-        low = self.lower_wall(x)
+        low = self.bulge(x) - R
         return Mesh(np.stack([x, low + (y + R) * (R - low) / (2.0 * R)], axis=1), mesh.cells)
 
 
@@ -245,7 +243,6 @@ class RoundPipe:
 
     def transport_mesh(self, fine: bool) -> tuple[Mesh, np.ndarray]:
         """Return a mesh of 13,689 nodes for the truth or 3,003 for the model, and its inlet."""
-        # finite elements: cached episodes do not need them
         from eitbench.numerics.round_meshes import extrude, uniform_disc
         rings, layers = (7, 80) if fine else (5, 32)
         section = uniform_disc(self.radius, rings)
@@ -359,22 +356,22 @@ class MeshVessel:
         return 16 if fine else 8
 
     def transport_mesh(self, fine: bool) -> tuple[Mesh, np.ndarray]:
-        _, (mesh, groups) = self._read(fine)
+        mesh, groups = self._read(fine)
         return mesh, np.unique(groups.get("inlet", np.empty(0, dtype=int)))
 
     def electrode_model(self, fine: bool) -> CompleteElectrodeModel:
         from eitbench.physics.cem import CompleteElectrodeModel
-        file, (mesh, groups) = self._read(fine)
+        mesh, groups = self._read(fine)
         numbered = {int(match[1]): facets for name, facets in groups.items()
                     if (match := re.fullmatch(r"electrode[ _-]?(\d+)", name, re.IGNORECASE))}
         first = 0 if 0 in numbered else 1
         numbers = range(first, first + self.n_electrodes)
         if missing := [f"electrode {number}" for number in numbers if number not in numbered]:
-            raise ValueError(f"{file}: must have a group for each electrode, got "
+            raise ValueError(f"{self.files[not fine]}: must have a group for each electrode, got "
                              f"none for {', '.join(missing)}; there are {', '.join(groups)}")
         if len(numbered) > self.n_electrodes:
             raise ValueError(f"n_electrodes must be {len(numbered)}, the number of groups "
-                             f"in {file}, got {self.n_electrodes}")
+                             f"in {self.files[not fine]}, got {self.n_electrodes}")
         electrodes = [numbered[number] for number in numbers]
         return CompleteElectrodeModel(mesh, electrodes, self.contact_impedance)
 
@@ -383,10 +380,9 @@ class MeshVessel:
         """Paths of the meshes, which a confined method may read."""
         return self.truth_mesh_file, self.model_mesh_file
 
-    def _read(self, fine: bool) -> tuple[str, MeshData]:
-        file, sha256 = ((self.truth_mesh_file, self.truth_mesh_sha256) if fine else
-                        (self.model_mesh_file, self.model_mesh_sha256))
-        return file, _read(file, sha256, self.scale)
+    def _read(self, fine: bool) -> MeshData:
+        sha256 = self.truth_mesh_sha256 if fine else self.model_mesh_sha256
+        return _read(self.files[not fine], sha256, self.scale)
 
 
 def _check_electrodes(vessel: PlanePipe | RoundPipe | RoundTank) -> None:

@@ -11,7 +11,7 @@ import numpy as np
 
 from eitbench import _check
 from eitbench.physics.observation import LinearConductivity, ObservationModel, VoltageNoise
-from eitbench.worlds.fields import check_positive
+from eitbench.worlds.fields import check_not_negative, check_positive
 from eitbench.worlds.instrument import Instrument
 from eitbench.worlds.random_streams import EpisodeStreams, episode_streams
 from eitbench.worlds.schedule import Schedule
@@ -43,32 +43,21 @@ class TruthTrajectory(NamedTuple):
 class Vessel(Protocol):
     """A container with electrodes on its wall: a frozen dataclass of SI numbers."""
 
-    @property
-    def contact_impedance(self) -> float:
-        """z in Ω·m²."""
-
-    @property
-    def molar_conductivity(self) -> float:
-        """Λ in S·m²/mol; σ = Λc."""
-
-    @property
-    def n_electrodes(self) -> int:
-        """L."""
-
-    @property
-    def coarse_grid_shape(self) -> tuple[int, int]:
-        """Cells along x and y of the grid on which an agent observes the estimate."""
-
-    @property
-    def is_elongated(self) -> bool:
-        """True if figures stack its images vertically."""
+    contact_impedance: float
+    """z in Ω·m²"""
+    molar_conductivity: float
+    """Λ in S·m²/mol; σ = Λc"""
+    n_electrodes: int
+    """L"""
+    coarse_grid_shape: tuple[int, int]
+    """cells along x and y of the grid on which an agent observes the estimate"""
+    is_elongated: bool
+    """True if figures stack its images vertically"""
+    n_truth_steps: int
+    """transport steps of the truth in a time step"""
 
     def transport_mesh(self, fine: bool) -> tuple[Mesh, np.ndarray]:
         """Return the transport mesh, ``fine`` for the truth, and the nodes of its inlet."""
-
-    @property
-    def n_truth_steps(self) -> int:
-        """Transport steps of the truth in a time step."""
 
     def substeps(self, fine: bool) -> int:
         """Return the Crank–Nicolson steps in a transport step of the truth or of the model."""
@@ -80,9 +69,8 @@ class Vessel(Protocol):
 class Flow(Protocol):
     """A flow configuration: a frozen dataclass of SI numbers. This class holds the defaults."""
 
-    @property
-    def diffusivity(self) -> float:
-        """κ in m²/s; for the estimator model only, if the truth is not advected."""
+    diffusivity: float
+    """κ in m²/s; for the estimator model only, if the truth is not advected"""
 
     def nominal(self, world: World, fine: bool) -> VelocityField | None:
         """Return the velocity of the truth (``fine``) or the estimator model; None: no flow."""
@@ -129,18 +117,12 @@ class Flow(Protocol):
 class Target(Protocol):
     """A moving or stationary concentration field: a frozen dataclass of SI numbers."""
 
-    @property
-    def background(self) -> float:
-        """Initial concentration (mol/m³) of the whole vessel."""
-
-    @property
-    def is_advected(self) -> bool:
-        """True if the flow advects the truth; otherwise the target computes its own motion."""
-
-    @property
-    def is_stationary(self) -> bool:
-        """True if the truth is stationary; such worlds have separate subtracks."""
-        return False
+    background: float
+    """initial concentration (mol/m³) of the whole vessel"""
+    is_advected: bool
+    """True if the flow advects the truth; otherwise the target computes its own motion"""
+    is_stationary: bool = False
+    """True if the truth is stationary; such worlds have separate subtracks"""
 
     def evolve(self, world: World, episodes: Sequence[EpisodeStreams], truth: Discretisation,
                tick: Callable[[int], object], last: int) -> Iterator[TruthTrajectory]:
@@ -167,9 +149,7 @@ class Prior:
 
     def __post_init__(self) -> None:
         check_positive(self, expected_concentration="mol/m³")
-        for name in ("inflow_std", "nodal_std", "initial_std"):
-            _check.number(name, getattr(self, name), low=0.0)
-        _check.number("initial_length", self.initial_length, low=0.0, units="m")
+        check_not_negative(self, inflow_std="", nodal_std="", initial_std="", initial_length="m")
 
 
 @dataclass(frozen=True)
@@ -198,7 +178,6 @@ class World:
 
     def __post_init__(self) -> None:
         for name, protocol in (("vessel", Vessel), ("flow", Flow), ("target", Target)):
-            add_current_members(type(getattr(self, name)))
             _check_part(name, getattr(self, name), protocol)
         for part in (self.vessel, self.flow, self.target):
             if hasattr(part, "check"):
@@ -231,11 +210,6 @@ class World:
         return self.schedule.time_step
 
     @property
-    def residence_steps(self) -> int:
-        """Time steps in which the mean flow passes through the vessel."""
-        return self.flow.residence_steps(self)
-
-    @property
     def spin_up_steps(self) -> int:
         """Time steps that the fluid flows before t = 0."""
         return self.flow.spin_up_steps(self)
@@ -245,7 +219,7 @@ class World:
         """First injections, not scored: by default one residence time, at least one cycle."""
         if self.schedule.warm_up is not None:
             return self.schedule.warm_up
-        return max(self.residence_steps, len(self.currents))
+        return max(self.flow.residence_steps(self), len(self.currents))
 
     @property
     def n_steps(self) -> int:
@@ -305,24 +279,6 @@ class World:
         """
         return self._discretise(self.flow.assumed_velocity(self, **assumed), fine=False)
 
-    def true_observation(self, truth: Discretisation,
-                         contacts: np.random.Generator) -> ObservationModel:
-        """Return the observation model of an episode, with its drawn contact impedances.
-
-        ``contacts`` is the unused stream of the episode.
-        """
-        model = truth.observation
-        if self.instrument.contact_impedance_spread == 0.0:
-            return model
-        factor = self.instrument.draw_contacts(contacts, self.vessel.n_electrodes)
-        return model.with_contacts(factor * model.cem.contact_impedance)
-
-    def evolve(self, episodes: Sequence[EpisodeStreams], truth: Discretisation,
-               tick: Callable[[int], object], last: int | None = None) -> Iterator[TruthTrajectory]:
-        """Simulate episodes up to state ``last`` (default: all); see `Target.evolve`."""
-        until = self.n_steps if last is None else last
-        return self.target.evolve(self, episodes, truth, tick, until)
-
     def sample_inflow(self, seed: int) -> np.ndarray:
         """Draw the inflow of an episode, (spin_up_steps + n_steps + 1, n_inlet) in mol/m³, at the
         nodes of the estimators' inlet from the beginning of the spin-up, without a simulation.
@@ -332,10 +288,15 @@ class World:
         seed = _check.integer("seed", seed, low=0)
         if not hasattr(self.target, "draw_inflow"):
             raise ValueError(f"the target must have an inflow, got {type(self.target).__name__}")
-        points = _inlet_points(self.vessel)
         inflow = self.target.draw_inflow(self, episode_streams(seed).inflow)
-        return np.array([inflow(points, t * self.time_step)
+        return np.array([inflow(self._inlet_points, t * self.time_step)
                          for t in range(-self.spin_up_steps, self.n_steps + 1)])
+
+    @cached_property
+    def _inlet_points(self) -> np.ndarray:
+        mesh, inlet = self.vessel.transport_mesh(fine=False)
+        points: np.ndarray = mesh.points[np.unique(inlet)]
+        return points
 
     def _discretise(self, velocity: VelocityField | None, fine: bool) -> Discretisation:
         # finite elements: cached episodes do not need them
@@ -406,16 +367,11 @@ class World:
         return replace(self.fault_free, instrument=instrument, prior=prior)
 
 
-@lru_cache(maxsize=8)
-def _inlet_points(vessel: Vessel) -> np.ndarray:
-    """Return the nodes (n_inlet, d) of the estimators' inlet in m."""
-    mesh, inlet = vessel.transport_mesh(fine=False)
-    return mesh.points[np.unique(inlet)]
-
-
 def _check_part(name: str, part: Any, protocol: type) -> None:
     """Raise ``ValueError`` unless a part has all members of its protocol."""
-    members = [member for member in vars(protocol) if not member.startswith("_")]
+    add_current_members(type(part))
+    members = dict.fromkeys(member for member in (*protocol.__annotations__, *vars(protocol))
+                            if not member.startswith("_"))
     if missing := [member for member in members if not hasattr(part, member)]:
         raise ValueError(f"{name} must be a {protocol.__name__}, with {', '.join(members)}; got "
                          f"{type(part).__name__} without {', '.join(missing)}")

@@ -73,7 +73,7 @@ def _draw_flows(axes: np.ndarray, figure, env: EstimationEnv, world: World) -> f
     velocity = real(mesh.points)
 
     def inside(points: np.ndarray) -> np.ndarray:
-        return points[:, 1] > pipe.lower_wall(points[:, 0])
+        return points[:, 1] > pipe.bulge(points[:, 0]) - pipe.half_width
 
     flows: dict[str, VelocityField] = {"true flow (Navier–Stokes)": real,
                                        "assumed: a parabola at each x":

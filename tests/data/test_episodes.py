@@ -1,9 +1,5 @@
 """Episodes: the truth is reproducible to the last bit, and finer than the estimators' model."""
 
-import hashlib
-import subprocess
-import sys
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,10 +8,8 @@ from eitbench.data.cache import episode_key, store
 from eitbench.data.episode_cache import cached_episode
 from eitbench.data.episodes import Episode, cached_truth_model, simulate
 from eitbench.worlds.catalogue import PIPE_2D
-from eitbench.worlds.world import Discretisation
-from scipy.stats import kstest
+from eitbench.worlds.random_streams import episode_streams
 
-from short import FAST
 from tiny_worlds import TINY
 
 pytestmark = pytest.mark.usefixtures("place")
@@ -44,19 +38,6 @@ def test_same_bits_in_this_process_from_the_cache_and_side_by_side(episode, monk
     assert bits(simulate(TINY, 7)) == bits(first) == bits(episode)
 
 
-def test_another_process_has_the_same_bits(episode, place):
-    """It leaves a single valid file with the bits made here."""
-    program = ("from eitbench.worlds.catalogue import PIPE_2D\n"
-               "from eitbench.data.episodes import simulate\n"
-               "import hashlib\n"
-               f"episode = simulate(PIPE_2D.with_changes({FAST!r}), 7)\n"
-               "print(hashlib.sha256(b''.join(array.tobytes() for array in episode)).hexdigest())")
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
-    assert done.stdout.strip() == hashlib.sha256(b"".join(array.tobytes() for array in episode)).hexdigest()
-    assert len([path for path in place.rglob("*") if path.is_file()]) == 1
-    assert bits(simulate(TINY, 7)) == bits(episode)
-
-
 def test_no_cache_neither_reads_nor_writes(episode, place):
     """`cache=False` does not change the folder and simulates even if a file exists."""
     simulate(TINY, 7, cache=False)
@@ -73,31 +54,15 @@ def test_seed_must_be_a_whole_number(seed):
             function(TINY, seed)
 
 
-def test_resistances_belong_to_the_concentrations(episode):
-    """𝓡 at index t − 1 belongs to the concentration at t, on the truth's EIT mesh."""
+def test_noise_and_resistances_belong_to_the_episode(episode):
+    """Noise is the episode's stream of standard normal numbers; 𝓡 at index t − 1 belongs to the concentration at t, on
+    the truth's EIT mesh."""
+    np.testing.assert_array_equal(episode.noise, episode_streams(7).noise.standard_normal((5, 4)))
     observation = cached_truth_model(TINY).observation
     for t in (1, 5):
         expected = observation.transfer_resistance(episode.concentration[t].astype(float))
         # Concentrations are stored in single precision, resistances as computed.
         np.testing.assert_allclose(episode.transfer_resistance[t - 1], expected, atol=1e-6 * np.abs(expected).max())
-
-
-def test_noise_is_standard_normal(monkeypatch):
-    """48,000 draws of one long episode are N(0, 1), and independent between measurements and steps."""
-    electrodes = SimpleNamespace(cem=SimpleNamespace(n_electrodes=16), transfer_resistance=lambda c: np.eye(16))
-    still = SimpleNamespace(mesh=SimpleNamespace(points=np.zeros((1, 2)), n_nodes=1),
-                            inlet=np.array([0]),
-                            # independent of the flow
-                            time_step=2.5e-3, step=lambda c, *_: c)
-    monkeypatch.setattr(episodes, "cached_truth_model", lambda _: Discretisation(still, electrodes))
-    long = PIPE_2D.with_changes({"schedule": {"scored_steps": 2982}})
-    noise = simulate(long, 5, cache=False).noise
-    assert noise.shape == (3000, 16)
-    assert abs(noise.mean()) < 4 / np.sqrt(noise.size)
-    assert abs(noise.var() - 1) < 4 * np.sqrt(2 / noise.size)
-    assert kstest(noise.ravel(), "norm").pvalue > 1e-3
-    neighbours = [(noise[1:] * noise[:-1]).mean(), (noise[:, 1:] * noise[:, :-1]).mean()]
-    assert np.abs(neighbours).max() < 4 / np.sqrt(noise.size)
 
 
 def test_inflow_has_slugs_of_both_signs_from_beginning_to_end():

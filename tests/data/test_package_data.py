@@ -64,6 +64,12 @@ def test_models_are_compared_in_one_basis():
 
 
 @pytest.mark.parametrize(("key", "same", "other"), [
+    (cache.folder,
+     [{"instrument": {"noise_relative": 0.05, "n_dead_range": [1, 1]}}, {"prior": {"inflow_std": 0.5}},
+      {"schedule": {"budget": 2}}],
+     [{"vessel": {"contact_impedance": 1e-3}}, {"flow": {"diffusivity": 1e-3}}, {"region": [0.1, 0.2]},
+      {"target": {"arrivals": {"interval": 0.021}}}, {"schedule": {"pattern": {"frame": 3}}},
+      {"instrument": {"current": 0.2}}, {"prior": {"expected_concentration": 24.0}}]),
     (lambda world: scoring_constants_file(world).key,
      [{"flow": {"mean_velocity": 4.0}}, {"instrument": {"noise_relative": 0.1}}, {"region": None},
       {"instrument": {"contact_impedance_spread": 0.5, "noise_mismatch": 2.0}},
@@ -77,10 +83,13 @@ def test_models_are_compared_in_one_basis():
      [{"instrument": {"noise_relative": 0.1}}, {"prior": {"nodal_std": 0.1}}, {"flow": {"mean_velocity": 4.0}},
       {"schedule": {"time_step": 4e-3}}, {"vessel": {"electrodes_per_wall": 4}}])])
 def test_a_file_belongs_to_its_numbers(key, same, other):
-    """Files are loaded for any value of parameters on which they do not depend, and not for others."""
+    """Files are loaded for any value of parameters on which they do not depend, and not for others. The digest in
+    records depends on all of them."""
     world = entry("eitbench/Pipe2DInjectionFlow-v0").world
-    assert all(key(world.with_changes(change)) == key(world) for change in same)
-    assert all(key(world.with_changes(change)) != key(world) for change in other)
+    worlds = [world, *map(world.with_changes, same), *map(world.with_changes, other)]
+    assert all(key(each) == key(world) for each in worlds[:1 + len(same)])
+    assert len({key(each) for each in worlds[len(same):]}) == 1 + len(other)
+    assert len({cache.world_digest(each) for each in worlds}) == len(worlds)
 
 
 @pytest.mark.parametrize("id", [id for id in builtin_ids() if entry(id).world.warm_up])

@@ -61,11 +61,6 @@ def asked(monkeypatch):
     return batches
 
 
-def names(place):
-    """Return the files of a folder."""
-    return sorted(path.name for path in place.iterdir())
-
-
 def stamps(place):
     """Return the files with their modification times."""
     return {path.name: (path.stat().st_ino, path.stat().st_mtime_ns) for path in place.iterdir()}
@@ -76,7 +71,7 @@ def test_recordings_have_the_bits_of_those_made_alone(place, alone, monkeypatch,
     use the new folder."""
     get_reusable_executor().shutdown(wait=True)      # workers keep their initial cache folder
     assert presimulate(TINY, SEEDS, n_jobs=2) == 4
-    assert names(place) == sorted(f"{seed}.npy" for seed in SEEDS)
+    assert stamps(place).keys() == {f"{seed}.npy" for seed in SEEDS}
     monkeypatch.setattr("eitbench.data.episode_cache.simulate", None)               # all are cached
     assert {seed: cached_episode(TINY, seed).tobytes() for seed in SEEDS} == alone
     monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path / "other"))
@@ -106,7 +101,7 @@ def test_interrupted_fill_keeps_what_is_done_and_resumes(place, asked, alone, sm
     real = cache.store
 
     def interrupted(key, arrays):
-        if len(names(place)) == 2:
+        if len(stamps(place)) == 2:
             raise KeyboardInterrupt
         real(key, arrays)
 
@@ -161,7 +156,7 @@ def test_full_disk_is_refused_before_anything_is_simulated(place, asked, monkeyp
     assert code == 2
     assert re.search("seeds need .* are free", complaint)
     assert "simulated" not in said
-    assert asked == [] and names(place) == []
+    assert asked == [] and not stamps(place)
     free[0] += 1
     for seeds, made in (("train:0", [0]), ("train:0-1", [1])):
         assert command("bank", "--seeds", seeds, "-j", "1")[0] == 0 and asked[-1] == made

@@ -1,7 +1,6 @@
 """Public seeds: disjoint ranges, and text that names them."""
 
 import warnings
-from itertools import combinations
 
 import pytest
 from eitbench.data.seeds import SPLITS, allow_test_seeds, format_seed, parse_seeds, warn_test_seeds
@@ -14,22 +13,13 @@ numbers = st.integers(0, 99_999)
 def test_splits_are_disjoint():
     """Splits for training, selection and scores are disjoint."""
     assert list(SPLITS) == ["train", "dev", "test"]
-    for a, b in combinations(SPLITS.values(), 2):
-        assert not set(a) & set(b)
+    assert len(set().union(*SPLITS.values())) == sum(map(len, SPLITS.values()))
 
 
 @given(st.integers(0, 2**31 - 1))
 def test_names_are_parsed_back(seed):
     """`parse_seeds` undoes `format_seed` for every seed, inside and outside the splits."""
     assert parse_seeds(format_seed(seed)) == [seed]
-
-
-@given(st.sampled_from(list(SPLITS)), numbers)
-def test_names_are_made_of_what_was_parsed(split, number):
-    """`format_seed` undoes `parse_seeds` within a split, and the seed lies in it."""
-    (seed,) = parse_seeds(f"{split}:{number}")
-    assert seed in SPLITS[split]
-    assert format_seed(seed) == f"{split}:{number}"
 
 
 @given(st.sampled_from(list(SPLITS)), st.lists(st.tuples(numbers, st.integers(0, 20)), min_size=1, max_size=5))

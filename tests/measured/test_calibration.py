@@ -17,12 +17,14 @@ def calibrate_tank(voltages, **options):
     return calibrate(ELECTRODES, CURRENTS, MATRIX, voltages, **options)
 
 
-def test_parameters_are_recovered_from_exact_voltages():
-    """The tolerance of the contact impedances covers the effect of their prior."""
-    calibration = calibrate_tank(homogeneous(noise=1e-6, frames=3))
+@pytest.mark.parametrize(("gain", "conductivity"), [(1.0, None), (1e3, SIGMA)])
+def test_parameters_are_recovered_from_exact_voltages(gain, conductivity):
+    """Without a specified conductivity the gain is 1. The tolerance of the contact impedances covers the effect of
+    their prior."""
+    calibration = calibrate_tank(gain * homogeneous(noise=1e-6, frames=3), conductivity=conductivity)
     assert calibration.conductivity == pytest.approx(SIGMA, rel=1e-4)
     np.testing.assert_allclose(calibration.contact_impedance, CONTACTS, rtol=0.03)
-    assert calibration.gain == 1.0
+    assert calibration.gain == (pytest.approx(gain, rel=1e-3) if conductivity else 1.0)
 
 
 def test_reported_uncertainty_is_the_scatter_of_repetitions():
@@ -37,26 +39,15 @@ def test_reported_uncertainty_is_the_scatter_of_repetitions():
     assert 0.3 < np.sqrt(np.mean(scatter[1:]**2)) < 1.6
 
 
-def test_noise_is_estimated_from_repeats():
-    calibration = calibrate_tank(homogeneous(noise=0.01, frames=20))
-    assert calibration.noise.relative == pytest.approx(0.01, rel=0.15)
-    assert calibration.noise_from_repeats
-
-
-def test_noise_is_estimated_from_frames_of_a_moving_target():
+def test_noise_is_estimated_from_repeats_and_from_frames_of_a_moving_target():
     """Third differences cancel slow changes; too few frames give no estimate."""
+    calibration = calibrate_tank(homogeneous(noise=0.01, frames=20))
+    assert calibration.noise.relative == pytest.approx(0.01, rel=0.15) and calibration.noise_from_repeats
     random = np.random.default_rng(0)
     slow = 1.0 + 0.2 * np.sin(np.linspace(0, 3, 100))[:, None, None] * np.ones((100, 8, 8))
     noise = noise_from_frames(slow * (1 + 0.01 * random.normal(size=slow.shape)))
     assert np.hypot(noise.relative, noise.floor) == pytest.approx(0.01, rel=0.1)
     assert noise_from_frames(slow[:5]) is None
-
-
-def test_gain_is_calibrated_if_the_conductivity_is_specified():
-    """Voltages in mV instead of V change the gain and nothing more."""
-    calibration = calibrate_tank(1e3 * homogeneous(), conductivity=SIGMA)
-    assert calibration.gain == pytest.approx(1e3, rel=1e-3)
-    np.testing.assert_allclose(calibration.contact_impedance, CONTACTS, rtol=0.03)
 
 
 @pytest.mark.parametrize(("voltages", "message"), [

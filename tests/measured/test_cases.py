@@ -12,7 +12,7 @@ from eitbench.bench import tracks
 from eitbench.bench.records import read_record, read_records, with_content_hash, write_record
 from eitbench.bench.runner import run_on_measurements
 from eitbench.envs.measured import case_env
-from eitbench.measured.cases import CASES, case_id, file_sha256, read_case
+from eitbench.measured.cases import CASES, file_sha256, read_case
 from eitbench.measured.segmentation import ktc_score
 from eitbench.report.site.measured import MeasuredBoards
 from scipy.io import savemat
@@ -49,7 +49,7 @@ def folder(tmp_path_factory):
 
 
 def test_built_in_cases_are_ids_outside_the_suites():
-    assert {case_id(name) for name in DIGESTS} == set(tracks.measured_ids())
+    assert {f"eitbench/Measured-{name}-v0" for name in DIGESTS} == set(tracks.measured_ids())
     assert {path.stem for path in CASES.glob("*.yml")} == set(DIGESTS)
     assert not set(tracks.measured_ids()) & set(tracks.ids())
     assert {name: read_case(name).digest[:8] for name in DIGESTS} == DIGESTS

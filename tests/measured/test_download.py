@@ -7,8 +7,7 @@ from threading import Thread
 
 import pytest
 import yaml
-from eitbench.measured.cases import CASES, file_sha256, read_case
-from eitbench.measured.download import download_case
+from eitbench.measured.cases import CASES, download_case, file_sha256, read_case
 from tanks import VESSEL
 
 from commands import eitbench

@@ -79,14 +79,11 @@ def hidden_after_reset(env, **arguments):
 
 
 def test_seeds_draw_the_withheld_measurements(masks_only):
+    """Each reset without a seed withholds other measurements; the same seed gives the same sequence."""
     one, other, repeated = (hidden_after_reset(masks_only, seed=seed) for seed in (1, 2, 1))
     assert (one != other).any()
     np.testing.assert_array_equal(one, repeated)
     np.testing.assert_array_equal(hidden_after_reset(masks_only, seed=200_001), one)         # test:1 is train:1
-
-
-def test_a_reset_without_a_seed_draws_from_the_generator(masks_only):
-    """Each reset withholds other measurements; the same seed gives the same sequence."""
     sequences = []
     for _ in range(2):
         masks_only.reset(seed=7)
@@ -220,8 +217,9 @@ def test_lost_measurements_are_left_out_one_by_one(measurements, clean):
 
 
 def test_spikes_are_named_and_left_out(measurements, clean):
-    """Voltages ten times too large change neither the estimate nor the score by a fifth."""
+    """Voltages ten times too large change neither the estimate nor the score by a fifth; motion is not a spike."""
     complete, position = clean
+    assert not find_spikes(measurements.voltages, measurements.injection_index).any()
     voltages = measurements.voltages.copy()
     voltages[3, 6] *= 10                                # in the first frame, which calibrates
     voltages[8 * 5 + 3, 6] *= 10
@@ -231,10 +229,6 @@ def test_spikes_are_named_and_left_out(measurements, clean):
     assert np.linalg.norm(found - position) < 5e-3
     assert run.withheld_rmse == pytest.approx(complete.withheld_rmse, rel=0.2)
     assert run.withheld_rmse_volts == pytest.approx(complete.withheld_rmse_volts, rel=0.2)
-
-
-def test_moving_targets_have_no_spikes(measurements):
-    assert not find_spikes(measurements.voltages, measurements.injection_index).any()
 
 
 def test_a_frame_is_not_scored_by_itself():

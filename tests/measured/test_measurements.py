@@ -57,14 +57,12 @@ def test_file_restores_all_fields(tmp_path):
     np.testing.assert_array_equal(part.voltages, measurements.voltages[8:12])
 
 
-def test_broken_files_are_named(tmp_path):
+@pytest.mark.parametrize("length", [0, 2000])
+def test_broken_files_are_named(tmp_path, length):
     path = moving(frames=1).save(tmp_path / "moving.h5")
-    path.write_bytes(path.read_bytes()[:2000])
+    path.write_bytes(path.read_bytes()[:length])
     with pytest.raises(ValueError, match=r"moving\.h5 must be a file of measurements"):
         Measurements.load(path)
-    (tmp_path / "empty.h5").write_bytes(b"")
-    with pytest.raises(ValueError, match="must be a file of measurements"):
-        Measurements.load(tmp_path / "empty.h5")
 
 
 def test_equal_injections_are_merged():
@@ -133,5 +131,3 @@ def test_selection_keeps_the_used_injections():
     np.testing.assert_array_equal(part.currents[part.injection_index],
                                   measurements.currents[measurements.injection_index[9:12]])
     np.testing.assert_array_equal(part.reference, measurements.reference[:, 1:4])
-    with pytest.raises(ValueError, match="steps must select some of the 24 measurement vectors, got"):
-        measurements.select(slice(30, 40))

@@ -1,5 +1,7 @@
 """Readers on generated files of each format, and on public files where present."""
 
+from hashlib import sha256
+
 import numpy as np
 import pytest
 from eitbench.measured import read
@@ -23,7 +25,7 @@ def test_ktc(tmp_path):
     np.testing.assert_array_equal(measurements.matrix, MATRIX)
     np.testing.assert_array_equal(measurements.voltages, VALUES)
     np.testing.assert_array_equal(measurements.reference, 2 * VALUES[None])
-    assert len(measurements.source["sha256"]) == 64
+    assert measurements.source["sha256"] == sha256((tmp_path / "data1.mat").read_bytes()).hexdigest()
 
 
 def test_kit4(tmp_path):
@@ -80,34 +82,34 @@ def test_sciospec(tmp_path):
 def test_truncated_frame_is_named(tmp_path):
     path = tmp_path / "setup_00001.eit"
     eit_file(path, np.ones((8, 8)))
-    lines = path.read_text(encoding="utf-8").splitlines()
-    path.write_text("\n".join(lines[:-1]), encoding="utf-8")
-    with pytest.raises(ValueError, match=r"setup_00001\.eit must hold blocks of lines"):
-        read(path)
-    path.write_text("\n".join([*lines[:-1], lines[-1][:40]]), encoding="utf-8")
-    with pytest.raises(ValueError, match=r"must hold blocks of lines"):
-        read(path)
-    path.write_text("", encoding="utf-8")
-    with pytest.raises(ValueError, match="must begin with the header"):
-        read(path)
+    text = path.read_text(encoding="utf-8").strip()
+    last = text.rindex("\n")
+    for kept, message in ((text[:last], "hold blocks of lines"), (text[:last + 40], "hold blocks of lines"),
+                          ("", "begin with the header")):
+        path.write_text(kept, encoding="utf-8")
+        with pytest.raises(ValueError, match=rf"setup_00001\.eit must {message}"):
+            read(path)
 
 
-def table(path, *, decimal=".", separator=","):
-    rows = [separator.join([str(k + 1), str((k + 1) % 8 + 1),
+def table(path, titles="", first="{:d}", decimal=".", separator=",", **description):
+    """Write a table, and its description in a YAML file."""
+    rows = [separator.join([first.format(k + 1), first.format((k + 1) % 8 + 1),
                             *[repr(float(each)).replace(".", decimal) for each in row]])
             for k, row in enumerate(VALUES)]
-    path.write_text("\n".join(rows), encoding="utf-8")
+    path.write_text("\n".join([*[titles] * bool(titles), *rows]), encoding="utf-8")
+    if description:
+        lines = [f"{name}: {value}" for name, value in description.items()]
+        path.with_suffix(".yml").write_text("\n".join(lines), encoding="utf-8")
+    return path
 
 
 def test_table(tmp_path):
     """A table of potentials in mV is described by a YAML file or by arguments."""
-    table(tmp_path / "tank.csv")
-    (tmp_path / "tank.yml").write_text("electrodes: 8\ncurrent: 1e-3\nunit: 0.001\n", encoding="utf-8")
-    measurements = read(tmp_path / "tank.csv")
+    measurements = read(table(tmp_path / "tank.csv", electrodes=8, current="1e-3", unit=0.001))
     np.testing.assert_allclose(measurements.currents, CURRENTS)
     np.testing.assert_allclose(measurements.voltages, 1e-3 * (VALUES - VALUES.mean(axis=1, keepdims=True)))
-    table(tmp_path / "comma.csv", decimal=",", separator=";")
-    same = read(tmp_path / "comma.csv", electrodes=8, current=1e-3, unit=1e-3, decimal=",")
+    comma = table(tmp_path / "comma.csv", decimal=",", separator=";")
+    same = read(comma, electrodes=8, current=1e-3, unit=1e-3, decimal=",")
     np.testing.assert_array_equal(same.voltages, measurements.voltages)
 
 
@@ -140,9 +142,8 @@ def test_a_lost_potential_or_a_spike_does_not_shift_the_others(tmp_path):
     ({"electrodes": 8, "current": 1.0, "unit": "mV"}, "unit must be a number in V.*got 'mV'"),
 ])
 def test_invalid_tables_are_rejected(tmp_path, options, message):
-    table(tmp_path / "comma.csv", decimal=",", separator=";")
     with pytest.raises(ValueError, match=message):
-        read(tmp_path / "comma.csv", **options)
+        read(table(tmp_path / "comma.csv", decimal=",", separator=";"), **options)
 
 
 KTC = {"Inj": CURRENTS.T, "Mpat": MATRIX.T, "Uel": VALUES}
@@ -178,14 +179,7 @@ def test_real_files(case, shape):
     assert measurements.voltages.shape == shape
 
 
-def described_table(path, titles="", readings=None, first="{:d}"):
-    """Write a table of two rows with its description."""
-    rows = [f"{first.format(k + 1)},{first.format(k + 2)}," + ",".join(f"{each:.6g}" for each in row)
-            for k, row in enumerate(VALUES[:2])]
-    path.write_text("\n".join([*[titles] * bool(titles), *rows]) + "\n")
-    extra = f"readings: {readings}\n" if readings else ""
-    path.with_suffix(".yml").write_text(f"electrodes: 8\ncurrent: 0.001\n{extra}")
-    return read(path)
+DESCRIPTION = {"electrodes": 8, "current": 0.001}
 
 
 @pytest.mark.parametrize(("titles", "first"), [
@@ -193,8 +187,8 @@ def described_table(path, titles="", readings=None, first="{:d}"):
     ("I+,I-," + ",".join(f"U{k}" for k in range(1, 9)), "{:d}")])
 def test_tables_of_potentials(tmp_path, titles, first):
     """Numbers with a decimal point are not titles, and a "-" in a title is not a difference."""
-    plain = described_table(tmp_path / "plain.csv")
-    other = described_table(tmp_path / "other.csv", titles, first=first)
+    plain = read(table(tmp_path / "plain.csv", **DESCRIPTION))
+    other = read(table(tmp_path / "other.csv", titles, first, **DESCRIPTION))
     np.testing.assert_array_equal(other.voltages, plain.voltages)
     np.testing.assert_array_equal(other.matrix, np.eye(8))
     np.testing.assert_array_equal(other.currents, plain.currents)
@@ -203,19 +197,32 @@ def test_tables_of_potentials(tmp_path, titles, first):
 def test_tables_of_differences(tmp_path):
     """Voltages are differences if titles name two electrodes, or by the description."""
     titles = "a,b," + ",".join(f"U{k + 1}-U{(k + 1) % 8 + 1}" for k in range(8))
-    for each in (described_table(tmp_path / "a.csv", titles),
-                 described_table(tmp_path / "b.csv", readings="neighbours")):
-        np.testing.assert_array_equal(each.matrix, MATRIX)
-    np.testing.assert_array_equal(described_table(tmp_path / "c.csv", titles, "potentials").matrix, np.eye(8))
+    for titles_given, readings, expected in ((titles, {}, MATRIX), ("", {"readings": "neighbours"}, MATRIX),
+                                             (titles, {"readings": "potentials"}, np.eye(8))):
+        measurements = read(table(tmp_path / "a.csv", titles_given, **DESCRIPTION, **readings))
+        np.testing.assert_array_equal(measurements.matrix, expected)
     with pytest.raises(ValueError, match="readings must be one of potentials, neighbours; got 'volts'"):
-        described_table(tmp_path / "d.csv", readings="volts")
+        read(table(tmp_path / "a.csv", **DESCRIPTION, readings="volts"))
+
+
+def test_first_rows_may_be_the_reference(tmp_path):
+    path = table(tmp_path / "a.csv", **DESCRIPTION)
+    path.write_text("\n".join([path.read_text()] * 3))
+    expected = VALUES - VALUES.mean(axis=1, keepdims=True)
+    measurements = read(path, reference_rows=16, time_step=0.5)
+    np.testing.assert_allclose(measurements.voltages, expected)
+    np.testing.assert_allclose(measurements.reference, [expected] * 2)
+    np.testing.assert_array_equal(measurements.times, 0.5 * np.arange(8))
+    for rows in (3, 24):
+        with pytest.raises(ValueError, match=f"reference_rows must be complete frames of .* injections, got {rows}"):
+            read(path, reference_rows=rows)
 
 
 def test_file_of_a_vessel_does_not_describe_a_table(tmp_path):
-    described_table(tmp_path / "tank.csv")
+    table(tmp_path / "tank.csv", **DESCRIPTION)
     (tmp_path / "tank.yml").rename(tmp_path / "tank.csv.yml")
     (tmp_path / "tank.yml").write_text("kind: circle\nradius: 0.1\n")
-    assert read(tmp_path / "tank.csv").voltages.shape == (2, 8)
+    assert read(tmp_path / "tank.csv").voltages.shape == (8, 8)
     (tmp_path / "tank.csv.yml").unlink()
     with pytest.raises(ValueError, match=r"neither tank\.csv\.yml"):
         read(tmp_path / "tank.csv")

@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 import yaml
-from eitbench.bench.runner import run_on_measurements
 from eitbench.envs.measured import MeasuredEnv
 from eitbench.measured.segmentation import centroid_errors, ktc_score, read_truth, segment
 from scipy.io import savemat
@@ -42,13 +41,7 @@ def test_score_is_the_mean_similarity_of_both_classes():
     estimate = disk(0.045, 0.01, 0.02, 1) + disk(-0.03, 0.03, 0.02, 2)
     expected = np.mean([similarity(1.0 * (kind == TRUTH), 1.0 * (estimate == kind)) for kind in (1, 2)])
     assert ktc_score(TRUTH, estimate) == pytest.approx(expected, abs=1e-9)
-
-
-def test_equal_segmentations_score_one_and_others_less():
     assert ktc_score(TRUTH, TRUTH) == pytest.approx(1.0)
-    near, far = (ktc_score(TRUTH, np.roll(TRUTH, shift, axis=1)) for shift in (5, 40))
-    swapped = ktc_score(TRUTH, np.choose(TRUTH, [0, 2, 1]))
-    assert 1.0 > near > far > swapped
 
 
 @pytest.fixture(scope="module")
@@ -73,13 +66,6 @@ def test_inclusions_of_an_estimate_have_their_positions(env):
 def test_homogeneous_fluid_has_no_inclusions(env):
     estimate = np.full(env.task.mesh.n_nodes, 1.5 * env.task.expected_concentration)
     assert not segment(env.vessel, env.task, estimate).any()
-
-
-def test_an_inclusion_is_located(env):
-    """The centroid error is less than 1 cm in a tank of 20 cm."""
-    classes = segment(env.vessel, env.task, run_on_measurements(env, "log_map").mean[-1], min_contrast=0.3)
-    (error,) = centroid_errors(env.vessel, disk(0.05, 0.0, 0.02, 1), classes)
-    assert error < 0.01
 
 
 def test_invalid_ground_truths_are_rejected(tmp_path):

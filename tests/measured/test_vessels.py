@@ -29,7 +29,8 @@ def test_a_yaml_file_equals_a_mapping(tmp_path):
     (PIPE | {"flow": {"mean_velocity": 1.0, "speed": 2.0}}, "vessel.flow must have mean_velocity"),
     (PIPE | {"flow": {"mean_velocity": -1.0}}, "mean_velocity must be a finite"),
     (CYLINDER | {"flow": {"mean_velocity": 1.0, "velocity_std": 0.1}}, "velocity_std must be 0 in a cylinder"),
-    (VESSEL | {"flow": {"mean_velocity": 1.0}}, "vessel of kind circle has no flow")])
+    (VESSEL | {"flow": {"mean_velocity": 1.0}}, "vessel of kind circle has no flow"),
+    ({"kind": "mesh", "file": "none.msh", "electrodes": 8}, r"vessel.file must be a mesh file, got none\.msh")])
 def test_invalid_entries_are_named(entries, message):
     with pytest.raises(ValueError, match=message):
         read_vessel(entries)
@@ -43,8 +44,3 @@ def test_electrodes_have_the_positions_of_the_description(direction):
     sign = 1 if direction == "clockwise" else -1
     assert np.argmax([y for _, y in middles]) == 0
     assert np.argmax([sign * x for x, _ in middles]) == 2
-
-
-def test_a_mesh_file_must_exist():
-    with pytest.raises(ValueError, match=r"vessel.file must be a mesh file, got none\.msh"):
-        read_vessel({"kind": "mesh", "file": "none.msh", "electrodes": 8})

@@ -19,11 +19,6 @@ from short import FAST, world
 from tiny_worlds import TINY
 
 
-def environment(**kwargs):
-    """The tiny world."""
-    return EstimationEnv("eitbench/Pipe2D-v0", world=FAST, **kwargs)
-
-
 @pytest.fixture(autouse=True)
 def cache(tmp_path, monkeypatch):
     """A separate cache folder for each test."""
@@ -59,7 +54,8 @@ def test_wrong_lags(lag):
 
 def test_assumed_velocity_changes_the_model_not_the_world(cache):
     """A wrong assumption changes the model's flow, not the episode and its voltages."""
-    right, wrong = environment(), environment(assume={"mean_velocity": 60.0})
+    right, wrong = (EstimationEnv("eitbench/Pipe2D-v0", world=FAST, assume=assume)
+                    for assume in (None, {"mean_velocity": 60.0}))
     rng = np.random.default_rng(2)
     c = rng.uniform(20.0, 40.0, 1701)
     moved = [env.task.transport.step(c, 30.0, 30.0) for env in (right, wrong)]

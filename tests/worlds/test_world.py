@@ -7,9 +7,18 @@ import pickle
 import numpy as np
 import pytest
 from eitbench.worlds import entries
-from eitbench.worlds.catalogue import PIPE_2D, PIPE_3D, ROTATING_TANK_2D, STATIONARY_TANK_2D
+from eitbench.worlds.catalogue import (
+    BUBBLE_TRACKING,
+    PIPE_2D,
+    PIPE_3D,
+    ROTATING_TANK_2D,
+    STATIONARY_TANK_2D,
+    TANK_TRACKING,
+)
 from eitbench.worlds.catalogue import PIPE_2D_TIME_VARYING as DRAWN
+from eitbench.worlds.flows import NoFlow
 from eitbench.worlds.random_streams import episode_streams, generator_from_state
+from eitbench.worlds.vessels import Bulge, PlanePipe, RoundTank
 
 SMALL_3D = dataclasses.replace(PIPE_3D.vessel, electrode_rings=2, electrodes_per_ring=4)
 
@@ -90,6 +99,17 @@ def test_every_number_can_be_named(id):
     (STATIONARY_TANK_2D, {"target": {"concentration_ratio": 0.0}}, "^world.target: concentration_ratio must be"),
     (STATIONARY_TANK_2D, {"target": {"small_radius": (0.018, 0.035)}}, "small_radius must not reach beyond large"),
     (STATIONARY_TANK_2D, {"target": {"small_radius": 0.02}}, r"small_radius must have shape \(2,\)"),
+    (TANK_TRACKING, {"target": {"radius_range": (0.01, 0.2)}}, "radius_range must end below half of the radius"),
+    (TANK_TRACKING, {"target": {"speed_range": (0.3, 0.1)}}, "speed_range must be a range"),
+    (TANK_TRACKING, {"target": {"run_time": 0.0}}, "run_time must be"),
+    (TANK_TRACKING, {"target": {"visit_time": -1.0}}, "visit_time must be"),
+    (TANK_TRACKING, {"instrument": {"readings": "some"}}, "readings must be one of all, neighbours"),
+    (BUBBLE_TRACKING, {"target": {"radius_range": (0.01, 0.045)}}, "radius_range and amplitude_range must have a sum"),
+    (BUBBLE_TRACKING, {"target": {"slip_range": (0.3, 0.1)}}, "slip_range must be a range"),
+    (BUBBLE_TRACKING, {"target": {"mean_wait": 0.0}}, "mean_wait must be"),
+    (BUBBLE_TRACKING, {"vessel": PlanePipe(bulge=Bulge())}, "target must be in a PlanePipe without a bulge"),
+    (BUBBLE_TRACKING, {"vessel": RoundTank()}, "target must be in a PlanePipe without a bulge"),
+    (BUBBLE_TRACKING, {"flow": NoFlow()}, "flow must be a flow through the pipe"),
 ], ids=str)
 def test_what_is_wrong_is_named(world, changes, message):
     """The message contains the part, the field, the value and the allowed range."""
