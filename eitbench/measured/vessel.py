@@ -15,7 +15,6 @@ from eitbench.measured.measurements import file_sha256
 from eitbench.measured.readers import load_yaml
 from eitbench.numerics.mesh import Mesh
 from eitbench.physics.cem import CompleteElectrodeModel
-from eitbench.worlds.fields import check_not_negative, check_positive
 from eitbench.worlds.vessels import MAX_COVERAGE, MeshVessel, PlanePipe, RoundPipe, RoundTank
 
 NUMBERING_DIRECTIONS = ("counter-clockwise", "clockwise")
@@ -45,8 +44,10 @@ class FlowConfig:
     """m/s, standard deviation of the mean velocity's random walk in a step"""
 
     def __post_init__(self) -> None:
-        check_positive(self, mean_velocity="m/s", diffusivity="m²/s")
-        check_not_negative(self, velocity_std="m/s", velocity_walk="m/s")
+        for name, units in (("mean_velocity", "m/s"), ("diffusivity", "m²/s"),
+                            ("velocity_std", "m/s"), ("velocity_walk", "m/s")):
+            _check.number(f"flow.{name}", getattr(self, name), low=0.0, units=units,
+                          open_low=not name.startswith("velocity"))
 
 
 @dataclass(frozen=True, eq=False)

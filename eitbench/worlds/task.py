@@ -21,54 +21,82 @@ if TYPE_CHECKING:
 
 
 class Estimate(NamedTuple):
-    """Estimate of one state: n nodes, L measurements of an injection, k flow parameters."""
+    """Estimate of one state: n nodes, L measurements of an injection, k flow parameters.
+
+    Attributes
+    ----------
+    mean : (n,) array
+        Concentration at the nodes of `Task.mesh`, mol/m³.
+    variance : (n,) array, optional
+        Error variance, (mol/m³)²; without it the calibration is not scored.
+    innovation : (L,) array, optional
+        Measured minus predicted voltages before the update, V; for the score NIS/m.
+    innovation_covariance : (L, L) array, optional
+        Covariance of the innovation, V².
+    velocity : (k,) array, optional
+        Parameters of the flow for `Task.velocity`, m/s; by default the prior mean.
+    velocity_variance : (k,) array, optional
+        Error variance of ``velocity``, m²/s².
+    """
 
     mean: np.ndarray
-    """(n,) mol/m³, concentration at the nodes of `Task.mesh`"""
     variance: np.ndarray | None = None
-    """(n,) (mol/m³)², error variance; without it the calibration is not scored"""
     innovation: np.ndarray | None = None
-    """(L,) V, measured minus predicted voltages before the update; for the score NIS/m"""
     innovation_covariance: np.ndarray | None = None
-    """(L, L) V², covariance of the innovation"""
     velocity: np.ndarray | None = None
-    """(k,) m/s, parameters of the flow for `Task.velocity`; by default the prior mean"""
     velocity_variance: np.ndarray | None = None
-    """(k,) m²/s², error variance of ``velocity``"""
 
 
 @dataclass(frozen=True, eq=False)
 class Task:
-    """Specification of an estimation problem; it does not contain the ground truth."""
+    """Specification of an estimation problem; it does not contain the ground truth.
+
+    Attributes
+    ----------
+    transport : Transport
+        Evolution model on ``mesh``, with the nominal flow.
+    observation : ObservationModel
+        Voltages as a function of a concentration on ``mesh``.
+    noise : VoltageNoise
+        Its ``std(voltages)`` is the standard deviation of each measurement, V.
+    currents : (K, L) array
+        Injection cycle, A (A/m in 2D).
+    n_steps : int
+        Number of measurement vectors of an episode, t = 1 … n_steps.
+    warm_up : int
+        States t ≤ ``warm_up`` are not scored.
+    lag : int
+        Measurement t requests the state t − lag: 0 is filtering, n_steps − 1 smoothing.
+    expected_concentration : float
+        Rough expectation in mol/m³, at which the fit of the homogeneous estimate starts.
+    calibration : int
+        Number of first injections to which ĉ_bh is fitted; usually in the warm-up.
+    prior : Prior
+        Prior of the target relative to the best homogeneous estimate (thesis Table 5.1).
+    velocity : VelocityModel, optional
+        Parametrisation of the flow if it is estimated; ``transport`` has its prior mean.
+    vessel : Vessel, optional
+        Sizes and electrodes.
+    world : str
+        Name of the world, by which trained models are found.
+    body : MovingBody, optional
+        Conductivity, sizes, and parameters of the motion of a body that moves by itself.
+    """
 
     transport: Transport
-    """evolution model on ``mesh``, with the nominal flow"""
     observation: ObservationModel
-    """voltages as a function of a concentration on ``mesh``"""
     noise: VoltageNoise
-    """its ``std(voltages)`` is the standard deviation of each measurement, V"""
     currents: np.ndarray = field(repr=False)
-    """(K, L) injection cycle, A (A/m in 2D)"""
     n_steps: int
-    """number of measurement vectors of an episode, t = 1 … n_steps"""
     warm_up: int
-    """states t ≤ ``warm_up`` are not scored"""
     lag: int
-    """measurement t requests the state t − lag: 0 is filtering, n_steps − 1 smoothing"""
     expected_concentration: float
-    """rough expectation in mol/m³, at which the fit of the homogeneous estimate starts"""
     calibration: int
-    """number of first injections to which ĉ_bh is fitted; usually in the warm-up"""
     prior: Prior
-    """prior of the target relative to the best homogeneous estimate (thesis Table 5.1)"""
     velocity: VelocityModel | None = None
-    """parametrisation of the flow if it is estimated; ``transport`` has its prior mean"""
     vessel: Vessel | None = None
-    """sizes and electrodes"""
     world: str = ""
-    """name of the world, by which trained models are found"""
     body: MovingBody | None = None
-    """conductivity, sizes, and parameters of the motion of a body that moves by itself"""
 
     @property
     def mesh(self) -> Mesh:
@@ -94,8 +122,16 @@ class Task:
 
 
 def make_task(world: World, lag: int | str = 0, **assumed: Any) -> Task:
-    """Return the task of a world with a lag in steps; "all" requests all states after the last
-    measurement. ``assumed`` are assumptions on the flow as of `World.estimator_model`."""
+    """Return the task of a world.
+
+    Parameters
+    ----------
+    world : World
+    lag : int or "all"
+        See `Task`; "all" requests all states after the last measurement.
+    assumed
+        Other assumptions on the flow than the default; see `World.estimator_model`.
+    """
     if not isinstance(world, World):
         raise TypeError(f"world must be a World, as of gymnasium.make(id).unwrapped, got {world!r}")
     steps = lag_steps(world, lag)
