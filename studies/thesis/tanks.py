@@ -127,7 +127,7 @@ def fig7_3(seeds: list[int], _jobs: int, out: Path) -> tuple[Path, str]:
     stationary = run_baseline(env, "gauss_newton", seeds[0])
     constant = run_baseline(env, "homogeneous", seeds[0])
     path = out / "fig7.3.png"
-    centres = disc.path(world, episode_streams(seeds[0]).flow)[1:]
+    centres = disc.path(world, episode_streams(seeds[0]).flow).centres[1:]
     distances = [_distances(env, estimates, centres) for estimates in (filtered, stationary)]
     _disc_figure(path, env, filtered, centres, distances)
     by_filter, by_stationary, by_constant = (episode_error(env, each)

@@ -116,7 +116,7 @@ def test_disc_is_tracked_with_one_pair_of_electrodes():
     env = environment("RotatingTank2D")
     world, points = env.world, env.task.mesh.points
     disc = world.target
-    path = disc.path(world, episode_streams(SEED).flow)[1:]
+    path = disc.path(world, episode_streams(SEED).flow).centres[1:]
     weights = np.ones(len(points))
 
     def distance(baseline):
