@@ -166,7 +166,7 @@ class Leaderboard(NamedTuple):
         seeds = {seed for record in self.records for seed in record["seeds"]}
         return seed_ranges(sorted(seeds)) if seeds else ""
 
-    def grouped(self) -> list[MethodRow]:
+    def group_trainings(self) -> list[MethodRow]:
         """Return the rows, training seeds of an agent grouped.
 
         Agents with at least two ranked training seeds become one row: the mean over these seeds,

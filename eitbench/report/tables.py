@@ -114,7 +114,7 @@ def filter_flags(row: MethodRow) -> str:
 
 def page_table(board: Leaderboard, root: str, *, compact: bool = False) -> Table:
     """Return a board for a page; ``root`` leads from the page to the site's folder."""
-    axes, together = score_axes(board), board.grouped()
+    axes, together = score_axes(board), board.group_trainings()
 
     def cells(row: MethodRow) -> dict[str, Cell]:
         badges = _outperformed(row, together) + author_badges(row)
@@ -249,7 +249,7 @@ def cost_chart(board: Leaderboard) -> charts.Chart | None:
     None without data."""
     points = [charts.ParetoPoint(row.cells["title"], row.colour, row.cells["seconds_per_step"],
                            row.cells["error"], row.is_ranked)
-              for row in board.grouped()
+              for row in board.group_trainings()
               if row.cells["error"] is not None and row.cells["seconds_per_step"]]
     if not points:
         return None

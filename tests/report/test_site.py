@@ -207,7 +207,7 @@ def board_of(records):
 def test_the_line_of_an_agent_is_the_mean_of_its_trainings():
     """An agent has error, skill score, interval over episodes, and one rank; Markdown has each training seed."""
     board = board_of(agents(record("ppo_seed3", [*of(0.5)[:5], None])))
-    placed = board.grouped()
+    placed = board.group_trainings()
     assert [row.cells["method"] for row in placed] == ["ppo", "between", "seer", "behind", "homogeneous"]
     row, parts = placed[0], placed[0].trainings
     assert [part.cells["method"] for part in parts] == ["ppo_seed2", "ppo_seed0", "ppo_seed1", "ppo_seed3"]
@@ -234,7 +234,7 @@ def test_the_line_of_an_agent_is_the_mean_of_its_trainings():
 def test_grouped_trainings(records, expected):
     """Records of one agent by the same submitter form a group if two have a rank."""
     board = board_of([record("homogeneous", list(LEVEL), **FLOOR), *records])
-    assert sorted(row.cells["method"] for row in board.grouped()) == sorted([*expected, "homogeneous"])
+    assert sorted(row.cells["method"] for row in board.group_trainings()) == sorted([*expected, "homogeneous"])
 
 
 def test_an_outperformed_reference_is_marked():

@@ -170,7 +170,7 @@ def index_page(site: Site) -> bytes:
     shown = {board.anchor: tables.page_table(board, "", compact=True) for board in site.boards
              if board.environment not in apart}
     filters, policies = site.board("filter", ALL), site.board("injection", AGENT_ENVIRONMENT)
-    best = [[row for row in board.grouped() if row.is_ranked] if board else []
+    best = [[row for row in board.group_trainings() if row.is_ranked] if board else []
             for board in (filters, policies)]
     return site.page(
         "index", headline=headline(site), filters=filters, policies=policies,
