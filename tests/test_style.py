@@ -9,7 +9,7 @@ import pytest
 
 ROOT = Path(__file__).parent.parent
 PACKAGE = ROOT / "eitbench"
-BUDGETS = {"numerics": 1658, "scoring": 121, "physics": 1640, "worlds": 2683, "data": 1477, "estimation": 6315,
+BUDGETS = {"numerics": 1658, "scoring": 121, "physics": 1640, "worlds": 2682, "data": 1477, "estimation": 6315,
            "measured": 1917, "envs": 1660, "bench": 4609, "report": 2738, "rl": 848, "cli": 997}
 """Package (or module) -> lines of Python allowed, blank lines and docstrings included. Each imports only from those
 before it."""

@@ -7,7 +7,6 @@ import re
 import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from functools import lru_cache
 from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any
@@ -28,6 +27,8 @@ ID_SETTINGS = {"estimation": ("lag", "assume"), "injection": ("gate", "inflow")}
 MAX_SETTINGS_BYTES = 10_000
 GROUPS = ("thesis examples", "extensions", "robustness variants", "injection", "user-defined")
 """Groups of ids in lists of environments."""
+RETURNS = list(csv.DictReader(Path(__file__).with_name("returns.csv").read_text().splitlines()))
+"""Rows of the file that ``studies/returns.py`` writes."""
 
 
 @dataclass(frozen=True)
@@ -126,13 +127,11 @@ def _add(entry: Entry) -> None:
                      reward_threshold=max(returns, default=None), kwargs={"name": entry.id})
 
 
-@lru_cache
 def published_returns(id: str) -> list[dict[str, str]]:
     """Return rows of an injection environment with the best random, open-loop, adaptive and trained
     policy: group, policy, mean return over dev:0-31 with the reduced filter, and half the width of
-    its 95 % interval. ``studies/returns.py`` writes them."""
-    with Path(__file__).with_name("returns.csv").open(newline="") as file:
-        return [row for row in csv.DictReader(file) if row["environment"] == id]
+    its 95 % interval."""
+    return [row for row in RETURNS if row["environment"] == id]
 
 
 def entries() -> dict[str, Entry]:
