@@ -17,7 +17,7 @@ from markupsafe import Markup
 from eitbench.report.templates import macro
 
 WIDTH, LEFT, RIGHT, TOP, BOTTOM = 860, 76, 830, 12, 314
-"""Width of a chart, and the edges of its axes, px."""
+"""Width of a chart, as in charts.svg.j2, and the edges of its axes, px."""
 CELL_WIDTH_PX = 96
 """Width of a drawing in a table's cell, px."""
 CHAR_WIDTH = 7.0
