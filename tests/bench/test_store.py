@@ -67,7 +67,7 @@ def test_concurrent_writers_lose_nothing(store):
     """Four threads write 32 episodes, and a reader never reads an incomplete file."""
     def write(worker):
         for seed in range(8):
-            store.put(result(8 * worker + seed, f"baseline{worker % 2}"), {"mean": np.ones((2, 2))})
+            store.put(result(n := 8 * worker + seed, f"baseline{worker % 2}"), {"mean": np.full((2, 2), n)})
 
     looks = []
     with warnings.catch_warnings(), ThreadPoolExecutor(4) as pool:
@@ -78,6 +78,7 @@ def test_concurrent_writers_lose_nothing(store):
     assert looks and looks == sorted(looks) and not any(writer.exception() for writer in writers)
     assert [len(record["episodes"]) for record in store.write_records()] == [16, 16]
     assert not [path for path in store.folder.rglob(".*") if path.is_file()]
+    assert all((store.fields(each)["mean"] == int(each["seed"].split(":")[1])).all() for each in store.results())
 
 
 # -- records ----------------------------------------------------------------------------------------------------------

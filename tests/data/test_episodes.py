@@ -1,6 +1,5 @@
 """Episodes: the truth is reproducible to the last bit, and finer than the estimators' model."""
 
-
 import numpy as np
 import pytest
 from eitbench.data import episodes
