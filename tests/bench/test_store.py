@@ -67,7 +67,7 @@ def test_concurrent_writers_lose_nothing(store):
     """Four threads write 32 episodes, and a reader never reads an incomplete file."""
     def write(worker):
         for seed in range(8):
-            store.put(result(n := 8 * worker + seed, f"baseline{worker % 2}"), {"mean": np.full((2, 2), n)})
+            store.put(result(n := 8 * worker + seed, f"baseline{worker % 2}"), {"mean": np.full((2, 2), 1.0 * n)})
 
     looks = []
     with warnings.catch_warnings(), ThreadPoolExecutor(4) as pool:
