@@ -26,7 +26,8 @@ KEY_DESCRIPTIONS = {
     "mean": "estimate on {columns} × {rows} patches, x first, mol/m³",
     "std": "standard deviation of the estimate, mol/m³",
     "doubt": "fault score: recent fraction of an electrode's measurements that the gate rejected, "
-             "and of injections through the electrode",
+             "and of injections through the electrode; if faults are estimated, probabilities of a "
+             "broken wire and of a bad contact",
     "velocity": "estimated mean velocity, m/s",
     "velocity_std": "standard deviation of the velocity, m/s",
     "body": f"estimate of the body, given that it is present: {'; '.join(BODY)}",
@@ -81,7 +82,7 @@ def _overview(env: Any) -> str:
     else:
         rules = env.rules
         rows |= {"injections before the agent's first": env.core.n_initial,
-                 "gate": f"{rules.gate:g}", "inflow": rules.inflow}
+                 "gate": f"{rules.gate:g}", "inflow": rules.inflow, "faults": rules.faults}
     return "\n".join(["| | |", "|---|---|", *(f"| {key} | `{value}` |"
                                               for key, value in rows.items())])
 

@@ -193,8 +193,8 @@ class ReducedFilter:
                gate: float = math.inf) -> tuple[np.ndarray, np.ndarray]:
         """Condition on innovations (B, m), with derivatives (B, m, s) and noise variances (B, m).
 
-        Measurements beyond the ``gate`` are rejected. Returns all predicted variances and the mask
-        of accepted measurements, (B, m) each.
+        Measurements beyond the ``gate`` are rejected, as are missing ones (NaN). Returns all
+        predicted variances and the mask of accepted measurements, (B, m) each.
         """
         P = self.covariance
         m = matrix.shape[1]
@@ -205,7 +205,7 @@ class ReducedFilter:
         accepted = gate_mask(innovation, variance, gate)
         if not accepted.all():  # remove rejected measurements from the update
             cross = cross * accepted[..., None]
-            innovation = innovation * accepted
+            innovation = np.where(accepted, innovation, 0.0)
             S *= accepted[:, :, None] & accepted[:, None, :]
             S[:, np.arange(m), np.arange(m)] += ~accepted
         self.innovation_covariance = S

@@ -163,6 +163,8 @@ PIPE_2D_FAULTS = add_injection(
         n_loose_range=(0, 2))),
     "Pipe2DInjectionFaults", test_seeds="test:0-49", gate=8.0)
 """A bad contact adds 0.5 to 2 Ω·m (an intact one has 0.08) and has five times the noise [E]."""
+add_injection(PIPE_2D_FAULTS, "Pipe2DInjectionInflowFaults", test_seeds="test:0-49",
+              inflow="learned", faults="estimated")
 
 PIPE_2D_INTERMITTENT = add_extension(
     World("Pipe2DIntermittent", PlanePipe(), LaminarFlow(),

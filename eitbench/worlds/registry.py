@@ -22,7 +22,7 @@ ENV_CLASSES = {
     "injection": ("eitbench.envs.injection:InjectionEnv",
                   "eitbench.envs.injection:InjectionVectorEnv")}
 """Track -> its environment and its vector environment."""
-ID_SETTINGS = {"estimation": ("lag", "assume"), "injection": ("gate", "inflow")}
+ID_SETTINGS = {"estimation": ("lag", "assume"), "injection": ("gate", "inflow", "faults")}
 """Track -> arguments of its environment that an id may fix, besides the world."""
 MAX_SETTINGS_BYTES = 10_000
 GROUPS = ("thesis examples", "extensions", "robustness variants", "injection", "user-defined")
@@ -77,9 +77,9 @@ def register(world: World, id: str, *, track: str = "estimation", description: s
     """Register a world under an id ``namespace/Name-vN``, for `gymnasium.make` and for runs.
 
     A world with other numbers needs another version. The arguments are the fields of `Entry`;
-    ``settings`` are ``lag`` and ``assume`` of estimation, ``gate`` and ``inflow`` of injection.
-    ``ValueError`` if the id has another form or belongs to another world, a setting is unknown, or
-    ``nominal`` has another task.
+    ``settings`` are ``lag`` and ``assume`` of estimation, ``gate``, ``inflow`` and ``faults`` of
+    injection. ``ValueError`` if the id has another form or belongs to another world, a setting is
+    unknown, or ``nominal`` has another task.
     """
     if not re.fullmatch(r"[\w.-]+/[\w.-]+-v\d+", id):
         raise ValueError(f"id must look like 'namespace/Name-v0', got {id!r}")

@@ -11,6 +11,7 @@ import scipy.sparse as sp
 from eitbench.data.episode_cache import scoring_constants
 from eitbench.estimation.body_particles import measured_first
 from eitbench.estimation.onboard.body_filters import BodyFilters
+from eitbench.estimation.onboard.electrode_faults import REJECTED_WEIGHT
 from eitbench.estimation.onboard.linearisation import Linearisation, linearisation_table
 from eitbench.estimation.onboard.reduced_filters import ReducedFilters
 from eitbench.estimation.onboard.rules import Rules
@@ -94,7 +95,7 @@ class Belief:
         measuring, self._driving = observation["doubt"]
         self.fault_score = measuring + self._driving
         """(L,) fraction of an electrode's recent measurements that were rejected, plus the fraction
-        of recent injections through it that failed"""
+        of recent injections through it that failed; or the probability that it has a fault"""
 
     @classmethod
     def from_prior(cls, rules: Rules) -> Belief:
@@ -118,8 +119,9 @@ class Belief:
         self._true_states = None
         self._clear_cache()
         measuring, driving = observation["doubt"]
-        self._driving = np.where(observation["currents"] == 0.0, FAULT_DECAY * self._driving,
-                                 driving)
+        if self._filters.faults is None:
+            driving = np.where(observation["currents"] == 0.0, FAULT_DECAY * self._driving, driving)
+        self._driving = driving
         self.fault_score = measuring + self._driving
 
     def condition_on_truth(self, entries: np.ndarray) -> None:
@@ -215,8 +217,9 @@ class Belief:
         covariance; see `pair_design_criteria`.
 
         Electrodes that are not ``healthy`` contribute no measurement, and pairs with one of them
-        score 0. By default ``jacobian`` is `jacobian`, and ``weight`` is for present errors in the
-        scored region.
+        score 0. Estimated faults increase the noise, and the criteria are multiplied by the
+        probability that the current flows. By default ``jacobian`` is `jacobian`, and ``weight`` is
+        for present errors in the scored region.
         """
         jacobian = self.jacobian if jacobian is None else jacobian
         entries, number = symmetric_entries(len(jacobian))
@@ -228,10 +231,12 @@ class Belief:
         weight = self._weight if weight is None else weight
         criteria = pair_design_criteria(DP @ D.T, DP @ weight @ DP.T,
                                         number[self.rules.pairs.T], variance)
+        usable = np.ones(len(self.rules.pairs))
+        if self._filters.faults is not None:
+            usable = self._filters.faults.flow_probability(self._driven)
         if healthy is not None:
-            usable = healthy[self.rules.pairs].all(axis=1)
-            criteria = criteria[0] * usable, criteria[1] * usable
-        return criteria
+            usable = usable * healthy[self.rules.pairs].all(axis=1)
+        return criteria[0] * usable, criteria[1] * usable
 
     def criteria(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the A- and D-criterion of each pair, (pairs,) each, of the next injection,
@@ -323,7 +328,15 @@ class Belief:
         R = self.linearisation.resistance
         voltages = self.rules.amplitude * (R[i] - R[j])
         std = self._filters.table.noise_std(voltages, self.rules.instrument.noise_floor)
-        return np.square(std / self.rules.amplitude)
+        variance = np.square(std / self.rules.amplitude)
+        if self._filters.faults is None:
+            return variance
+        return variance / np.maximum(self._filters.faults.weights(self._driven), REJECTED_WEIGHT)
+
+    @property
+    def _driven(self) -> np.ndarray:
+        """(pairs, L) mask of the driven electrodes of each pair."""
+        return self.rules.action_currents[:len(self.rules.pairs)] != 0.0
 
 
 class BodyBelief:

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
 
 from eitbench.data.episode_cache import score_mass, step_error
+from eitbench.estimation.onboard.electrode_faults import REJECTED_WEIGHT, ElectrodeFaults
 from eitbench.estimation.onboard.linearisation import linearisation_table
 from eitbench.estimation.onboard.rules import Rules
 
@@ -44,25 +46,34 @@ class EpisodeFilters:
     rules : Rules
     frames : (B, K, L)
         Voltages in V of the first frame, the world's cycle.
+    faults : ElectrodeFaults, optional
+        Default: a new one if the rules prescribe that faults are estimated.
     """
 
-    def __init__(self, rules: Rules, frames: np.ndarray) -> None:
+    def __init__(self, rules: Rules, frames: np.ndarray,
+                 faults: ElectrodeFaults | None = None) -> None:
+        B, _, L = frames.shape
         self._rules = rules
+        if faults is None and rules.faults == "estimated":
+            faults = ElectrodeFaults(rules.instrument, (B, L), rules.world.n_steps)
+        self.faults = faults
+        """None: measurements beyond the gate are rejected"""
         self.table = linearisation_table(rules.world)
         self.indices = self._reference_indices(frames)
         """indices of c_ref in the table"""
         self.c_ref = np.array([self.table.c_ref(k) for k in self.indices])
         """(B,) ĉ_bh in mol/m³"""
-        B, _, L = frames.shape
         self._start(B)
         for k, currents in enumerate(rules.world.currents):
             self._condition(frames[:, k], np.repeat(currents[None], B, axis=0))
         self._innovations = np.zeros((B, L))
         self._doubt = np.zeros((B, 2, L))
+        self._show_faults()
 
     def _reference_indices(self, frames: np.ndarray) -> list[int]:
         """Return the index of c_ref of each episode in the table, from the first frame."""
-        return self.table.nearest_indices(frames, self._rules.gate)
+        robust = math.isfinite(self._rules.gate) or self.faults is not None
+        return self.table.nearest_indices(frames, robust)
 
     def _start(self, episodes: int) -> None:
         """Create the filters at t = 0."""
@@ -72,6 +83,9 @@ class EpisodeFilters:
         """Predict and condition on voltages (B, L) in V for currents (B, L) in A (A/m in 2D), all
         zero without an injection."""
         self._innovations, accepted = self._condition(voltages, currents)
+        if self.faults is not None:
+            self._show_faults()
+            return
         # Fault scores of each electrode: moving averages of the fraction of rejected measurements
         # at it, and of failed injections through it.
         reading = self._doubt[:, 0]
@@ -87,6 +101,22 @@ class EpisodeFilters:
         """Predict and condition as `assimilate` does; return the innovations in predicted standard
         deviations and the mask of accepted measurements, both (B, L)."""
         raise NotImplementedError
+
+    def _show_faults(self) -> None:
+        """Take the fault scores from estimated faults: probabilities of a broken wire and of a bad
+        contact."""
+        if self.faults is not None:
+            self._doubt = np.moveaxis(self.faults.probabilities[..., 1:], 2, 1)
+
+    def _weigh(self, voltages: np.ndarray, innovation: np.ndarray, signal: np.ndarray,
+               noise_variance: np.ndarray, currents: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Update estimated faults; return the innovations in V, NaN where measurements are
+        rejected, and their noise variances in V². The arguments are as in
+        `ElectrodeFaults.update`."""
+        assert self.faults is not None
+        weights = self.faults.update(voltages, innovation, signal, noise_variance, currents)
+        used = weights > REJECTED_WEIGHT
+        return np.where(used, innovation, np.nan), noise_variance / np.where(used, weights, 1.0)
 
     def features(self) -> dict[str, np.ndarray]:
         """Return innovations (B, L) in predicted standard deviations, mean and std (B, patches) in

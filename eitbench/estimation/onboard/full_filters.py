@@ -10,7 +10,7 @@ import numpy as np
 
 from eitbench import _check
 from eitbench.estimation.filter import Filter, StateSpace, Step
-from eitbench.estimation.gaussian import LinearMeasurement
+from eitbench.estimation.gaussian import LinearMeasurement, innovate
 from eitbench.estimation.inflow_window import InflowWindow
 from eitbench.estimation.nodal import nodal_states
 from eitbench.estimation.onboard.body_filters import BodyFilters, FullBodyFilters
@@ -45,14 +45,42 @@ class FullFilters(EpisodeFilters):
         innovations = np.zeros_like(voltages)
         accepted = np.ones(voltages.shape, dtype=bool)
         self._last = [None] * len(voltages)
+        measurements: dict[int, LinearMeasurement] = {}
         for b, filter_ in enumerate(self._filters):
             filter_.predict()
             if currents[b].any():
-                step = filter_.update(self._measurement(b, voltages[b], currents[b]))
-                self._last[b] = step
-                accepted[b] = step.accepted
+                measurements[b] = self._measurement(b, voltages[b], currents[b])
+        weighted = measurements
+        if self.faults is not None:
+            weighted, innovations = self._weigh_measurements(measurements, voltages, currents)
+        for b, measurement in weighted.items():
+            step = self._filters[b].update(measurement)
+            self._last[b] = step
+            accepted[b] = step.accepted
+            if self.faults is None:
                 innovations[b] = step.innovation / np.sqrt(step.innovation_covariance.diagonal())
         return innovations, accepted
+
+    def _weigh_measurements(
+            self, measurements: dict[int, LinearMeasurement], voltages: np.ndarray,
+            currents: np.ndarray) -> tuple[dict[int, LinearMeasurement], np.ndarray]:
+        """Update estimated faults; return the measurements with values NaN where rejected and the
+        noise of the faults, and all innovations (B, L) in predicted standard deviations."""
+        B, L = voltages.shape
+        innovation, noise = np.zeros((B, L)), np.ones((B, L))
+        signal = np.zeros((B, L, L))
+        for b, measurement in measurements.items():
+            filter_ = self._filters[b]
+            H = filter_.space.jacobian(filter_.mean, measurement.matrix)
+            residual = measurement.value - measurement.matrix @ filter_.concentration
+            innovation[b], signal[b], _ = innovate(filter_.covariance, H, residual, np.zeros(L))
+            noise[b] = measurement.noise_variance
+        used, weighted_noise = self._weigh(voltages, innovation, signal, noise, currents)
+        weighted = {b: each._replace(value=np.where(np.isnan(used[b]), np.nan, each.value),
+                                     noise_variance=weighted_noise[b])
+                    for b, each in measurements.items()}
+        variance = signal.diagonal(axis1=1, axis2=2) + noise
+        return weighted, innovation / np.sqrt(variance)
 
     def _measurement(self, b: int, voltages: np.ndarray, currents: np.ndarray) -> LinearMeasurement:
         """Return the measurement (L,) of the relative concentration (n,) of an episode."""
@@ -111,10 +139,14 @@ def state_space(world: World, inflow: str) -> StateSpace:
 
 def filters_class(rules: Rules, estimator: str) -> type[EpisodeFilters] | None:
     """Return the filters' class for one of `ESTIMATOR_OPTIONS`, None for "none". ``ValueError`` for
-    another option, or if the rules have a learned inflow that the world does not permit."""
+    another option, or if the rules have a learned inflow or estimated faults that the world does
+    not permit."""
     _check.choice("estimator", estimator, ESTIMATOR_OPTIONS)
     if estimator == "none":
         return None
+    if rules.faults == "estimated" and (rules.instrument.max_faulty == 0 or rules.tracks_body):
+        raise ValueError("faults must be 'gate' for an instrument without faults and for a body, "
+                         "got 'estimated'")
     if rules.inflow == "learned":
         if not hasattr(rules.world.target, "draw_inflow"):
             raise ValueError("inflow must be 'white' for a target without inflow, got 'learned' "

@@ -71,13 +71,13 @@ class LinearisationTable:
         """Pickle the world only."""
         return linearisation_table, (self.world,)
 
-    def nearest_indices(self, frames: np.ndarray, gate: float) -> list[int]:
+    def nearest_indices(self, frames: np.ndarray, robust: bool) -> list[int]:
         """Return the grid index of the best fit to each frame of voltages (B, K, L) in V, weighted
-        as in `best_homogeneous`; with a finite gate, residuals are limited to `OUTLIER_SIGMA`."""
-        limit = OUTLIER_SIGMA if math.isfinite(gate) else math.inf
+        as in `best_homogeneous`; a robust fit limits residuals to `OUTLIER_SIGMA`."""
+        limit = OUTLIER_SIGMA if robust else math.inf
         indices = []
         for frame in frames:
-            scale = frame if math.isinf(limit) else self._homogeneous
+            scale = self._homogeneous if robust else frame
             residuals = (frame - self._homogeneous) / self.world.noise.std(scale)
             misfit = np.minimum(residuals**2, limit**2).sum(axis=(1, 2))
             indices.append(int(C_REF_INDICES[np.argmin(misfit)]))

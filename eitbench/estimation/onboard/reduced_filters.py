@@ -44,9 +44,14 @@ class ReducedFilters(EpisodeFilters):
         matrix /= std[..., None].astype(np.float32)
         residual = ((voltages - computed) / std).astype(np.float32) * driven
         innovation = residual - matvec(matrix, coordinates - about)
-        variance, accepted = self.filter.update(
-            states.jacobian(mean, matrix), innovation, np.ones_like(residual),
-            gate=self._rules.gate)
+        jacobian = states.jacobian(mean, matrix)
+        used, noise = innovation, np.ones_like(residual)
+        if self.faults is not None:
+            signal = (jacobian @ self.filter.covariance) @ np.swapaxes(jacobian, 1, 2)
+            used, noise = self._weigh(voltages, innovation * std,
+                                      signal * (std[:, :, None] * std[:, None]), std**2, currents)
+            used, noise = (used / std).astype(np.float32), (noise / std**2).astype(np.float32)
+        variance, accepted = self.filter.update(jacobian, used, noise, gate=self._rules.gate)
         self._last = innovation, std, accepted, currents
         return (innovation / np.sqrt(variance)).astype(float), accepted
 

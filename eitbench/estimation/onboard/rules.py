@@ -17,6 +17,9 @@ from eitbench.worlds.world import World
 INFLOW_MODELS = ("white", "learned")
 """Inflow priors of the estimator: white noise (Table 5.1), or a coloured logarithm fitted to
 training episodes (``docs/methods.md``, 10)."""
+FAULT_MODELS = ("gate", "estimated")
+"""Treatment of electrode faults by the estimator: it rejects measurements beyond the gate, or
+estimates the state of each electrode (``docs/methods.md``, 19)."""
 
 
 @dataclass(frozen=True)
@@ -38,17 +41,21 @@ class Rules:
         True if the first frame is measured before the agent's first injection.
     inflow : "white" or "learned"
         Inflow prior of the estimator: Table 5.1, or fitted to training episodes.
+    faults : "gate" or "estimated"
+        Treatment of electrode faults by the estimator; see `FAULT_MODELS`.
     """
 
     world: World
     gate: float = np.inf
     has_first_frame: bool = True
     inflow: str = "white"
+    faults: str = "gate"
 
     def __post_init__(self) -> None:
         if self.gate != np.inf:
             _check.number("gate", self.gate, low=0.0, open_low=True)
         _check.choice("inflow", self.inflow, INFLOW_MODELS)
+        _check.choice("faults", self.faults, FAULT_MODELS)
 
     @property
     def instrument(self) -> Instrument:
@@ -97,7 +104,8 @@ class Rules:
     @property
     def tuning_key(self) -> str:
         """Key of tuned values: the world's name, with suffixes for faults and a budget."""
-        faults = " with faults" * (self.instrument.max_faulty > 0)
+        estimated = "estimated " * (self.faults == "estimated")
+        faults = f" with {estimated}faults" * (self.instrument.max_faulty > 0)
         budget = " with a budget" * (self.budget is not None)
         return self.world.name + faults + budget
 
