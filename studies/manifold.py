@@ -3,7 +3,7 @@
 N pipes with rare slugs share an instrument that injects into one of them in each step, through a
 pair at the inlet; each pipe has its own reduced filter with a learned inflow. The table has the
 mean error of all pipes relative to injections in turn, for policies that see the filters, and for
-one that knows the true errors.
+one that has the true errors.
 """
 
 from __future__ import annotations
