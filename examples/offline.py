@@ -3,7 +3,7 @@
 The data are Minari sets of one environment whose action is an electrode pair:
 
     eitbench export --format minari --env eitbench/BubbleTracking-v0 --policy random_pair \
-        --seeds train:0-255 --out eitbench/bubbles/random-pair-v0
+        --seeds train:0-191 --out eitbench/bubbles/random-pair-v0
     python examples/offline.py eitbench/bubbles/random-pair-v0
 
 Data of one pair also inform the values of pairs with a common electrode. The script prints the
@@ -21,7 +21,7 @@ from torch import Tensor, nn
 
 from eitbench.data.seeds import parse_seeds
 
-GAMMA, CONSERVATISM = 0.9, 0.1
+GAMMA, CONSERVATISM = 0.3, 0.01
 BATCH, LEARNING_RATE, AVERAGING, REWARD_SCALE = 256, 3e-4, 0.005, 200.0
 WIDTH, FEATURES = 256, 8
 
@@ -80,7 +80,7 @@ def train(pairs: np.ndarray, data: dict[str, Tensor], updates: int, seed: int = 
         values = network(part["seen"])
         taken = values.gather(1, part["action"][:, None]).squeeze(1)
         with torch.no_grad():
-            best = network(part["next"]).argmax(1, keepdim=True)                   # double Q-learning
+            best = network(part["next"]).argmax(1, keepdim=True)        # double Q-learning
             following = target(part["next"]).gather(1, best).squeeze(1)
             expected = part["reward"] + GAMMA * (1.0 - part["last"]) * following
         excess = (values.logsumexp(1) - taken).mean()
@@ -114,7 +114,7 @@ def mean_return(env: gym.Env, network: Values, seeds: list[int]) -> float:
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("data", nargs="+", help="names of Minari data sets")
-    parser.add_argument("--updates", type=int, default=20_000)
+    parser.add_argument("--updates", type=int, default=5000)
     parser.add_argument("--dev", default="dev:0-31", help="episodes of the evaluation")
     given = parser.parse_args()
     torch.set_num_threads(1)

@@ -176,6 +176,15 @@ def test_criteria_avoid_broken_electrodes(played: tuple[InjectionCore, np.ndarra
     assert (after[~touched] < before[~touched]).all()
 
 
+def test_open_inputs_may_measure_zero() -> None:
+    """Broken wires without interference are found too."""
+    quiet = replace(WORLD, instrument=replace(WORLD.instrument, interference=0.0))
+    core, errors = play(Rules(quiet, inflow="learned", faults="estimated"), SEEDS[:1])
+    broken = core.faults.open_circuit_from <= core.t - 16
+    assert core._filters.faults.probabilities[broken, BROKEN].min() > 0.99
+    assert np.isfinite(errors[-1]).all()
+
+
 @pytest.mark.parametrize("id", ["eitbench/Pipe2DInjection-v0", "eitbench/TankTracking-v0"])
 def test_estimated_faults_require_an_instrument_with_faults(id: str) -> None:
     with pytest.raises(ValueError, match="faults must be 'gate' for an instrument without faults"):

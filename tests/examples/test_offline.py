@@ -6,7 +6,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-
 from eitbench.bench.minari_export import export_minari
 
 from short import shorten

@@ -46,6 +46,8 @@ class ElectrodeFaults:
         dead, failing, loose = (sum(each) / (2.0 * shape[1]) for each in ranges)
         self.probabilities = np.tile([1.0 - dead - loose, dead, loose], (*shape, 1))
         self._break_rate = failing / n_steps
+        # an open input without interference measures zero
+        self._interference_variance = max(instrument.interference, instrument.noise_floor, 1e-6)**2
         self._instrument = instrument
 
     def weights(self, driven: np.ndarray) -> np.ndarray:
@@ -116,16 +118,15 @@ class ElectrodeFaults:
         extra = (high - low)**2 / 12.0 * currents**2 + instrument.loose_noise**2 * noise_variance
         return np.stack([
             _log_density(innovation, variance + noise_variance),
-            _log_density(voltages, np.full(voltages.shape, instrument.interference**2)),
+            _log_density(voltages, self._interference_variance),
             _log_density(innovation - 0.5 * (low + high) * currents, variance + extra)], axis=-1)
 
     def _densities_without_flow(self, voltages: np.ndarray, predicted: np.ndarray) -> np.ndarray:
         """Return the logarithmic densities (B, L, 3) of voltages by state if no current flows."""
         smallest = 1e-3 * np.abs(predicted).max(axis=1, keepdims=True)
-        silent = _log_density(voltages, self._instrument.noise_floor**2 + smallest**2
-                              + np.zeros(voltages.shape))
-        interference = np.full(voltages.shape, self._instrument.interference**2)
-        return np.stack([silent, _log_density(voltages, interference), silent], axis=-1)
+        silent = _log_density(voltages, self._instrument.noise_floor**2 + smallest**2)
+        interference = _log_density(voltages, self._interference_variance)
+        return np.stack([silent, interference, silent], axis=-1)
 
     def _blame(self, failed: np.ndarray, driven: np.ndarray, likely: np.ndarray,
                densities: np.ndarray) -> None:
@@ -172,9 +173,9 @@ class ElectrodeFaults:
         return weights
 
 
-def _log_density(values: np.ndarray, variance: np.ndarray) -> np.ndarray:
+def _log_density(values: np.ndarray, variance: np.ndarray | float) -> np.ndarray:
     """Return the logarithmic density of a normal distribution with mean zero."""
-    return -0.5 * (values**2 / variance + np.log(2.0 * np.pi * variance))
+    return np.asarray(-0.5 * (values**2 / variance + np.log(2.0 * np.pi * variance)))
 
 
 def _mixture(probabilities: np.ndarray, densities: np.ndarray) -> np.ndarray:
