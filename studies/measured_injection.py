@@ -19,7 +19,8 @@ from tqdm import tqdm
 
 from eitbench.bench.methods import builtin_methods, load_module
 from eitbench.envs.measured import MeasuredEnv
-from eitbench.estimation import StationaryMap
+from eitbench.estimation import StationaryMap, gauss_newton
+from eitbench.estimation.nodal import initial_covariance
 from eitbench.estimation.walk import matern_modes
 from eitbench.measured.cases import read_case
 from eitbench.measured.segmentation import ktc_score, segment
@@ -56,15 +57,13 @@ class Frame:
         log_map = builtin_methods("estimation")["log_map"]
         exponential = load_module("estimator", log_map, log_map.read_bytes()).exponential
         self.estimator = StationaryMap(task, task.expected_concentration, exponential)
+        self.penalty = np.linalg.inv(initial_covariance(task.mesh, task.prior))
         self.modes = task.prior.initial_std * matern_modes(task.mesh, task.prior.initial_length)
 
     def estimate(self, chosen: list[int], start: np.ndarray) -> np.ndarray:
         """Return u (n,) = ln c/c_0 from the chosen injections."""
-        estimator = self.estimator
-        estimator._record = [(self.voltages[k], self.currents[k]) for k in chosen]
-        estimator._u = start
-        estimator.estimate()
-        return estimator._u
+        return gauss_newton(self.estimator, self.voltages[chosen], self.currents[chosen],
+                            self.std[chosen], self.penalty, start)
 
     def score(self, chosen: list[int], u: np.ndarray) -> tuple[float, float]:
         """Return the RMS error of the other injections in standard deviations, and KTC's score."""
