@@ -38,7 +38,7 @@ def test_it_avoids_actions_that_the_data_lack():
 
 
 def test_values_follow_the_bellman_equation(monkeypatch):
-    """In an endless chain with reward 1 all values tend to 1/(1 − γ), if nothing is conservative."""
+    """All values of an endless chain with reward 1 tend to 1/(1 − γ), if nothing is conservative."""
     monkeypatch.setattr(offline, "CONSERVATISM", 0.0)
     monkeypatch.setattr(offline, "AVERAGING", 0.05)
     data = bandit(200, 3) | {"reward": torch.ones(200), "last": torch.zeros(200)}
