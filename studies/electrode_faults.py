@@ -47,8 +47,7 @@ class KnownFaults(ElectrodeFaults):
         self.probabilities[..., BROKEN] = broken
         self.probabilities[..., LOOSE] = loose
         self.probabilities[..., INTACT] = ~broken & ~loose
-        driven = currents != 0.0
-        return self.weights(driven) * self.flow_probability(driven)[:, None]
+        return self.flow_probability(currents != 0.0) == 1.0
 
 
 def main() -> None:

@@ -1,19 +1,25 @@
 """Estimated electrode faults: against enumeration of all states, and in the environment."""
 
+import sys
 from dataclasses import replace
 from itertools import product
+from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
 import pytest
 from eitbench.data.episode_cache import instrument_faults
 from eitbench.envs.injection_core import InjectionCore
+from eitbench.estimation.onboard import episode_filters
 from eitbench.estimation.onboard.belief import Belief
 from eitbench.estimation.onboard.electrode_faults import BROKEN, LOOSE, ElectrodeFaults
 from eitbench.estimation.onboard.rules import Rules
 from eitbench.worlds import entry
 from eitbench.worlds.instrument import Instrument
 from scipy.stats import multivariate_normal
+
+sys.path.append(str(Path(__file__).parents[2] / "studies"))
+from electrode_faults import KnownFaults
 
 ID = "eitbench/Pipe2DInjectionInflowFaults-v0"
 L = 5
@@ -123,16 +129,8 @@ def test_faults_of_the_environment_are_found(played: tuple[InjectionCore, np.nda
 def test_a_filter_with_estimated_faults_is_as_good_as_with_known_ones(
         played: tuple[InjectionCore, np.ndarray], monkeypatch: pytest.MonkeyPatch) -> None:
     core, errors = played
-
-    def known(self: ElectrodeFaults, voltages: np.ndarray, *others: np.ndarray) -> np.ndarray:
-        self.t = getattr(self, "t", 0) + 1
-        broken = self.t >= core.faults.open_circuit_from
-        loose = ~broken & (core.faults.noise_factor > 1.0)
-        self.probabilities = np.stack([~broken & ~loose, broken, loose], axis=-1).astype(float)
-        driven = others[-1] != 0.0
-        return self.weights(driven) * self.flow_probability(driven)[:, None]
-
-    monkeypatch.setattr(ElectrodeFaults, "update", known)
+    monkeypatch.setattr(episode_filters, "ElectrodeFaults",
+                        lambda instrument, shape, n_steps: KnownFaults(instrument, n_steps, core.faults))
     told = play(RULES, SEEDS)[1]
     assert np.nanmean(errors, axis=0) == pytest.approx(np.nanmean(told, axis=0), rel=0.02)
 

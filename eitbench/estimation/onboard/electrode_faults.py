@@ -50,15 +50,14 @@ class ElectrodeFaults:
         self._interference_variance = max(instrument.interference, instrument.noise_floor, 1e-6)**2
         self._instrument = instrument
 
-    def weights(self, driven: np.ndarray) -> np.ndarray:
+    def weights(self, driven: np.ndarray, probabilities: np.ndarray | None = None) -> np.ndarray:
         """Return the expected inverse noise variance (..., L) of each measurement, relative to an
-        intact electrode, for the mask (..., L) of the driven electrodes."""
-        return self._weights(self.probabilities, driven)
-
-    def _weights(self, probabilities: np.ndarray, driven: np.ndarray) -> np.ndarray:
+        intact electrode, for the mask (..., L) of the driven electrodes; by default for the present
+        probabilities."""
+        p = self.probabilities if probabilities is None else probabilities
         # the resistance of a bad contact is unknown: its voltage while driven is not used
-        return probabilities[..., INTACT] + np.where(
-            driven, 0.0, probabilities[..., LOOSE] / self._instrument.loose_noise**2)
+        return np.asarray(p[..., INTACT] + np.where(
+            driven, 0.0, p[..., LOOSE] / self._instrument.loose_noise**2))
 
     def flow_probability(self, driven: np.ndarray) -> np.ndarray:
         """Return the probability (...) that the current flows through all ``driven`` electrodes
@@ -67,8 +66,7 @@ class ElectrodeFaults:
 
     def update(self, voltages: np.ndarray, innovation: np.ndarray, signal: np.ndarray,
                noise_variance: np.ndarray, currents: np.ndarray) -> np.ndarray:
-        """Condition on the measurements of one step; return their weights (B, L), zero if the
-        injection failed.
+        """Condition on the measurements of one step; return (B,) bool: the current flowed.
 
         Parameters
         ----------
@@ -85,25 +83,34 @@ class ElectrodeFaults:
         self.probabilities *= 1.0 - self._break_rate
         self.probabilities[..., BROKEN] += self._break_rate
         self._normalise()
-        likely = self.flow_probability(driven)
+        prior = self.flow_probability(driven)
         flowing = np.where(driven[..., None], [1.0, 0.0, 1.0], 1.0) * self.probabilities
         flowing /= flowing.sum(axis=-1, keepdims=True)
         variance = SIGNAL_FACTOR * signal.diagonal(axis1=1, axis2=2)
         with_flow = self._densities(voltages, innovation, variance, noise_variance, currents)
         without = self._densities_without_flow(voltages, voltages - innovation)
-        evidence = np.log([likely, 1.0 - likely + MIN_PROBABILITY])
+        evidence = np.log([prior, 1.0 - prior + MIN_PROBABILITY])
         evidence += [_mixture(flowing, with_flow), _mixture(self.probabilities, without)]
         injected = driven.any(axis=1)
         flows = injected & (evidence[0] > evidence[1])
         failed = injected & ~flows
         if failed.any():
-            self._blame(failed, driven[failed], likely[failed], without[failed])
-        weights = np.zeros(voltages.shape)
+            self._condition_on_failure(failed, driven[failed], prior[failed], without[failed])
         if flows.any():
-            weights[flows] = self._sweep(flows, flowing[flows], voltages[flows], innovation[flows],
-                                         signal[flows], noise_variance[flows], currents[flows])
+            self.probabilities[flows] = self._sweep(
+                flowing[flows], voltages[flows], innovation[flows], signal[flows],
+                noise_variance[flows], currents[flows])
         self._normalise()
-        return weights
+        return np.asarray(flows)
+
+    def weigh(self, voltages: np.ndarray, innovation: np.ndarray, signal: np.ndarray,
+              noise_variance: np.ndarray, currents: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Condition as `update` does; return the innovations, NaN where the measurement is
+        rejected, and the noise variances of faulty electrodes, (B, L) each."""
+        flows = self.update(voltages, innovation, signal, noise_variance, currents)
+        weights = flows[:, None] * self.weights(currents != 0.0)
+        used = weights > REJECTED_WEIGHT
+        return np.where(used, innovation, np.nan), noise_variance / np.where(used, weights, 1.0)
 
     def _normalise(self) -> None:
         np.maximum(self.probabilities, MIN_PROBABILITY, out=self.probabilities)
@@ -124,27 +131,26 @@ class ElectrodeFaults:
     def _densities_without_flow(self, voltages: np.ndarray, predicted: np.ndarray) -> np.ndarray:
         """Return the logarithmic densities (B, L, 3) of voltages by state if no current flows."""
         smallest = 1e-3 * np.abs(predicted).max(axis=1, keepdims=True)
-        silent = _log_density(voltages, self._instrument.noise_floor**2 + smallest**2)
+        zero = _log_density(voltages, self._instrument.noise_floor**2 + smallest**2)
         interference = _log_density(voltages, self._interference_variance)
-        return np.stack([silent, interference, silent], axis=-1)
+        return np.stack([zero, interference, zero], axis=-1)
 
-    def _blame(self, failed: np.ndarray, driven: np.ndarray, likely: np.ndarray,
-               densities: np.ndarray) -> None:
-        """Condition the ``failed`` episodes on voltages without a current: a driven wire is
-        broken."""
+    def _condition_on_failure(self, failed: np.ndarray, driven: np.ndarray, flow: np.ndarray,
+                              densities: np.ndarray) -> None:
+        """Condition the ``failed`` episodes on voltages without a current: a driven wire is broken.
+        ``flow`` is the prior probability of a current."""
         before = self.probabilities[failed]
         broken = before[..., BROKEN]
-        broken = np.where(driven, broken / (1.0 - likely + MIN_PROBABILITY)[:, None], broken)
+        broken = np.where(driven, broken / (1.0 - flow + MIN_PROBABILITY)[:, None], broken)
         broken = np.clip(broken, MIN_PROBABILITY, 1.0 - MIN_PROBABILITY)
         others = (1.0 - broken) / (1.0 - before[..., BROKEN])
         prior = before * others[..., None]
         prior[..., BROKEN] = broken
         self.probabilities[failed] = _posterior(prior, densities)
 
-    def _sweep(self, flows: np.ndarray, prior: np.ndarray, voltages: np.ndarray,
-               innovation: np.ndarray, signal: np.ndarray, noise_variance: np.ndarray,
-               currents: np.ndarray) -> np.ndarray:
-        """Condition the episodes in which current ``flows``; return the weights.
+    def _sweep(self, prior: np.ndarray, voltages: np.ndarray, innovation: np.ndarray,
+               signal: np.ndarray, noise_variance: np.ndarray, currents: np.ndarray) -> np.ndarray:
+        """Return the probabilities (B, L, 3) given the measurements of a current that flows.
 
         Each measurement is compared with its prediction by the filter and the other measurements
         of the injection, which have the noise of their weights.
@@ -152,7 +158,7 @@ class ElectrodeFaults:
         driven = currents != 0.0
         diagonal = np.arange(voltages.shape[1])
         after = prior.copy()
-        weights = self._weights(after, driven)
+        weights = self.weights(driven, after)
         k = np.arange(len(voltages))             # episodes that have not converged
         for _ in range(MAX_SWEEPS):
             noise = noise_variance[k] / np.maximum(weights[k], 1e-6)
@@ -165,12 +171,11 @@ class ElectrodeFaults:
             after[k] = _posterior(prior[k], self._densities(
                 voltages[k], residual, variance, noise_variance[k], currents[k]))
             before = weights[k]
-            weights[k] = self._weights(after[k], driven[k])
+            weights[k] = self.weights(driven[k], after[k])
             k = k[(np.abs(weights[k] - before) > WEIGHT_TOLERANCE).any(axis=1)]
             if not len(k):
                 break
-        self.probabilities[flows] = after
-        return weights
+        return after
 
 
 def _log_density(values: np.ndarray, variance: np.ndarray | float) -> np.ndarray:

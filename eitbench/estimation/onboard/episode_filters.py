@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from eitbench.data.episode_cache import score_mass, step_error
-from eitbench.estimation.onboard.electrode_faults import REJECTED_WEIGHT, ElectrodeFaults
+from eitbench.estimation.onboard.electrode_faults import BROKEN, LOOSE, ElectrodeFaults
 from eitbench.estimation.onboard.linearisation import linearisation_table
 from eitbench.estimation.onboard.rules import Rules
 
@@ -68,7 +68,6 @@ class EpisodeFilters:
             self._condition(frames[:, k], np.repeat(currents[None], B, axis=0))
         self._innovations = np.zeros((B, L))
         self._doubt = np.zeros((B, 2, L))
-        self._show_faults()
 
     def _reference_indices(self, frames: np.ndarray) -> list[int]:
         """Return the index of c_ref of each episode in the table, from the first frame."""
@@ -83,9 +82,6 @@ class EpisodeFilters:
         """Predict and condition on voltages (B, L) in V for currents (B, L) in A (A/m in 2D), all
         zero without an injection."""
         self._innovations, accepted = self._condition(voltages, currents)
-        if self.faults is not None:
-            self._show_faults()
-            return
         # Fault scores of each electrode: moving averages of the fraction of rejected measurements
         # at it, and of failed injections through it.
         reading = self._doubt[:, 0]
@@ -102,29 +98,16 @@ class EpisodeFilters:
         deviations and the mask of accepted measurements, both (B, L)."""
         raise NotImplementedError
 
-    def _show_faults(self) -> None:
-        """Take the fault scores from estimated faults: probabilities of a broken wire and of a bad
-        contact."""
-        if self.faults is not None:
-            self._doubt = np.moveaxis(self.faults.probabilities[..., 1:], 2, 1)
-
-    def _weigh(self, voltages: np.ndarray, innovation: np.ndarray, signal: np.ndarray,
-               noise_variance: np.ndarray, currents: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Update estimated faults; return the innovations in V, NaN where measurements are
-        rejected, and their noise variances in V². The arguments are as in
-        `ElectrodeFaults.update`."""
-        assert self.faults is not None
-        weights = self.faults.update(voltages, innovation, signal, noise_variance, currents)
-        used = weights > REJECTED_WEIGHT
-        return np.where(used, innovation, np.nan), noise_variance / np.where(used, weights, 1.0)
-
     def features(self) -> dict[str, np.ndarray]:
         """Return innovations (B, L) in predicted standard deviations, mean and std (B, patches) in
         mol/m³, the fault scores doubt (B, 2, L), and, if estimated, velocity and its std in m/s, or
         `BODY`."""
         mean, std = self.coarse_grid()
+        doubt = self._doubt
+        if self.faults is not None:
+            doubt = np.moveaxis(self.faults.probabilities[..., [BROKEN, LOOSE]], 2, 1)
         shown = {"innovations": self._innovations.copy(), "mean": mean, "std": std,
-                 "doubt": self._doubt.copy()}
+                 "doubt": doubt.copy()}
         if (flow := self.velocity()) is not None:
             shown |= {"velocity": flow[0], "velocity_std": flow[1]}
         if (body := self.body()) is not None:

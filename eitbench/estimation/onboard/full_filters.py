@@ -14,6 +14,7 @@ from eitbench.estimation.gaussian import LinearMeasurement, innovate
 from eitbench.estimation.inflow_window import InflowWindow
 from eitbench.estimation.nodal import nodal_states
 from eitbench.estimation.onboard.body_filters import BodyFilters, FullBodyFilters
+from eitbench.estimation.onboard.electrode_faults import ElectrodeFaults
 from eitbench.estimation.onboard.episode_filters import EpisodeFilters, Innovation
 from eitbench.estimation.onboard.inflow_states import fit_world_prior
 from eitbench.estimation.onboard.linearisation import linearisation_table, std_from_variance
@@ -50,22 +51,21 @@ class FullFilters(EpisodeFilters):
             filter_.predict()
             if currents[b].any():
                 measurements[b] = self._measurement(b, voltages[b], currents[b])
-        weighted = measurements
         if self.faults is not None:
-            weighted, innovations = self._weigh_measurements(measurements, voltages, currents)
-        for b, measurement in weighted.items():
+            innovations = self._weigh(self.faults, measurements, voltages, currents)
+        for b, measurement in measurements.items():
             step = self._filters[b].update(measurement)
             self._last[b] = step
             accepted[b] = step.accepted
             if self.faults is None:
-                innovations[b] = step.innovation / np.sqrt(step.innovation_covariance.diagonal())
+                innovations[b] = step.innovation
+            innovations[b] /= np.sqrt(step.innovation_covariance.diagonal())
         return innovations, accepted
 
-    def _weigh_measurements(
-            self, measurements: dict[int, LinearMeasurement], voltages: np.ndarray,
-            currents: np.ndarray) -> tuple[dict[int, LinearMeasurement], np.ndarray]:
-        """Update estimated faults; return the measurements with values NaN where rejected and the
-        noise of the faults, and all innovations (B, L) in predicted standard deviations."""
+    def _weigh(self, faults: ElectrodeFaults, measurements: dict[int, LinearMeasurement],
+               voltages: np.ndarray, currents: np.ndarray) -> np.ndarray:
+        """Update the ``faults``, set values of ``measurements`` to NaN where they are rejected and
+        their noise to the noise of the faults; return all innovations (B, L) in V."""
         B, L = voltages.shape
         innovation, noise = np.zeros((B, L)), np.ones((B, L))
         signal = np.zeros((B, L, L))
@@ -75,12 +75,11 @@ class FullFilters(EpisodeFilters):
             residual = measurement.value - measurement.matrix @ filter_.concentration
             innovation[b], signal[b], _ = innovate(filter_.covariance, H, residual, np.zeros(L))
             noise[b] = measurement.noise_variance
-        used, weighted_noise = self._weigh(voltages, innovation, signal, noise, currents)
-        weighted = {b: each._replace(value=np.where(np.isnan(used[b]), np.nan, each.value),
-                                     noise_variance=weighted_noise[b])
-                    for b, each in measurements.items()}
-        variance = signal.diagonal(axis1=1, axis2=2) + noise
-        return weighted, innovation / np.sqrt(variance)
+        used, noise = faults.weigh(voltages, innovation, signal, noise, currents)
+        for b, each in measurements.items():
+            value = np.where(np.isnan(used[b]), np.nan, each.value)
+            measurements[b] = each._replace(value=value, noise_variance=noise[b])
+        return innovation
 
     def _measurement(self, b: int, voltages: np.ndarray, currents: np.ndarray) -> LinearMeasurement:
         """Return the measurement (L,) of the relative concentration (n,) of an episode."""

@@ -48,8 +48,9 @@ class ReducedFilters(EpisodeFilters):
         used, noise = innovation, np.ones_like(residual)
         if self.faults is not None:
             signal = (jacobian @ self.filter.covariance) @ np.swapaxes(jacobian, 1, 2)
-            used, noise = self._weigh(voltages, innovation * std,
-                                      signal * (std[:, :, None] * std[:, None]), std**2, currents)
+            used, noise = self.faults.weigh(voltages, innovation * std,
+                                            signal * (std[:, :, None] * std[:, None]), std**2,
+                                            currents)
             used, noise = (used / std).astype(np.float32), (noise / std**2).astype(np.float32)
         variance, accepted = self.filter.update(jacobian, used, noise, gate=self._rules.gate)
         self._last = innovation, std, accepted, currents
