@@ -9,7 +9,7 @@ import pytest
 
 ROOT = Path(__file__).parent.parent
 PACKAGE = ROOT / "eitbench"
-BUDGETS = {"numerics": 1658, "scoring": 121, "physics": 1639, "worlds": 2684, "data": 1477, "estimation": 6583,
+BUDGETS = {"numerics": 1658, "scoring": 121, "physics": 1639, "worlds": 2684, "data": 1477, "estimation": 6579,
            "measured": 1917, "envs": 1663, "bench": 4609, "report": 2738, "rl": 848, "cli": 997}
 """Package (or module) -> lines of Python allowed, blank lines and docstrings included. Each imports only from those
 before it."""

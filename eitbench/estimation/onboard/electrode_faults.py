@@ -18,7 +18,7 @@ faults."""
 REJECTED_WEIGHT = 0.01
 """Weight at and below which a measurement is rejected."""
 MIN_PROBABILITY = 1e-7
-"""Lower bound of all probabilities, so that later measurements can revise them."""
+"""Lower bound of all probabilities before a measurement, so that it can revise them."""
 
 
 class ElectrodeFaults:
@@ -82,7 +82,8 @@ class ElectrodeFaults:
         driven = currents != 0.0
         self.probabilities *= 1.0 - self._break_rate
         self.probabilities[..., BROKEN] += self._break_rate
-        self._normalise()
+        np.maximum(self.probabilities, MIN_PROBABILITY, out=self.probabilities)
+        self.probabilities /= self.probabilities.sum(axis=-1, keepdims=True)
         prior = self.flow_probability(driven)
         flowing = np.where(driven[..., None], [1.0, 0.0, 1.0], 1.0) * self.probabilities
         flowing /= flowing.sum(axis=-1, keepdims=True)
@@ -100,7 +101,6 @@ class ElectrodeFaults:
             self.probabilities[flows] = self._sweep(
                 flowing[flows], voltages[flows], innovation[flows], signal[flows],
                 noise_variance[flows], currents[flows])
-        self._normalise()
         return np.asarray(flows)
 
     def weigh(self, voltages: np.ndarray, innovation: np.ndarray, signal: np.ndarray,
@@ -111,10 +111,6 @@ class ElectrodeFaults:
         weights = flows[:, None] * self.weights(currents != 0.0)
         used = weights > REJECTED_WEIGHT
         return np.where(used, innovation, np.nan), noise_variance / np.where(used, weights, 1.0)
-
-    def _normalise(self) -> None:
-        np.maximum(self.probabilities, MIN_PROBABILITY, out=self.probabilities)
-        self.probabilities /= self.probabilities.sum(axis=-1, keepdims=True)
 
     def _densities(self, voltages: np.ndarray, innovation: np.ndarray, variance: np.ndarray,
                    noise_variance: np.ndarray, currents: np.ndarray) -> np.ndarray:
