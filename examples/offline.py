@@ -115,7 +115,7 @@ if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("data", nargs="+", help="names of Minari data sets")
     parser.add_argument("--updates", type=int, default=5000)
-    parser.add_argument("--dev", default="dev:0-31", help="episodes of the evaluation")
+    parser.add_argument("--dev", default="dev:32-63", help="episodes of the evaluation")
     given = parser.parse_args()
     torch.set_num_threads(1)
     env, transitions, of_data = load(given.data)
