@@ -5,7 +5,9 @@ import json
 
 import numpy as np
 import pytest
+from eitbench.bench.isolation import bubblewrap_problem
 
+ISOLATION = "process" if bubblewrap_problem() else "bubblewrap"
 ID = "bubbles/BubbleTank-v0"
 INJECTION = "bubbles/BubbleTankInjection-v0"
 
@@ -37,7 +39,8 @@ def test_method_and_score_make_a_record_and_a_board(installed):
         (["leaderboard", "--records", records], "wrote"),
         (["compare", "bubble_tracker", "gauss_newton", "--records", records, "--score", "bubble_distance"],
          "distance of A"),
-        (["verify", "--top", 2, "--records", records, "--episodes", 1, "--jobs", 1], "2 of 2 records agree"),
+        (["verify", "--top", 2, "--records", records, "--episodes", 1, "--jobs", 1, "--isolate", ISOLATION],
+         "2 of 2 records agree"),
         (["run", "--env", INJECTION, "--policy", "random_pair", "--policy", "opposite", "--seeds", "dev:0",
           "--estimator", "reduced", "--out", "played", "--jobs", 1], "opposite"),
         (["render", "--env", ID, "--baseline", "bubble_tracker", "--step", 20, "--out", "bubble.png"], "wrote"),

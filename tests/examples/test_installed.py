@@ -6,6 +6,7 @@ import zipfile
 from pathlib import Path
 
 import pytest
+from eitbench.bench.isolation import bubblewrap_problem
 from eitbench.bench.methods import builtin_files
 from eitbench.bench.records import read_record
 from eitbench.bench.verify import is_builtin_record, job_for_record
@@ -94,5 +95,6 @@ def test_an_agent_s_record_asks_for_its_model(installed, empty, tmp_path):
     record = read_record(RESULTS / AGENT)
     ours = builtin_files(record["environment"]["id"])[record["method"]]
     copy = shutil.copy(ours, tmp_path / "model.zip")
-    assert job_for_record(record, copy).method == str(copy) and is_builtin_record(record, str(copy))
+    isolate = "process" if bubblewrap_problem() else "bubblewrap"
+    assert job_for_record(record, copy, isolate).method == str(copy) and is_builtin_record(record, str(copy))
     assert not is_builtin_record(record | {"method_sha256": "0" * 64}, str(copy))
