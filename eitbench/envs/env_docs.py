@@ -20,9 +20,10 @@ from eitbench.worlds.world import World
 KEY_DESCRIPTIONS = {
     "voltages": "measured electrode potentials relative to their mean, V, with noise",
     "currents": "injected currents, A (in 2D A per metre of depth), summing to zero",
-    "recent": "the last four injections, the latest first",
+    "recent": "currents of the last four steps, or of the last four injections, the latest first",
     "frame": "voltages of the first frame; not in the scaled observation",
-    "innovations": "measured minus predicted voltages, in predicted standard deviations",
+    "innovations": "measured minus predicted voltages of the last step, or of the last injection, "
+                   "in predicted standard deviations",
     "mean": "estimate on {columns} × {rows} patches, x first, mol/m³",
     "std": "standard deviation of the estimate, mol/m³",
     "doubt": "fault score: recent fraction of an electrode's measurements that the gate rejected, "
@@ -31,6 +32,7 @@ KEY_DESCRIPTIONS = {
     "velocity": "estimated mean velocity, m/s",
     "velocity_std": "standard deviation of the velocity, m/s",
     "body": f"estimate of the body, given that it is present: {'; '.join(BODY)}",
+    "waited": "steps since the last injection",
     "left": "remaining steps and, with a budget, remaining injections",
 }
 """Meaning of each entry of an observation."""
@@ -82,7 +84,8 @@ def _overview(env: Any) -> str:
     else:
         rules = env.rules
         rows |= {"injections before the agent's first": env.core.n_initial,
-                 "gate": f"{rules.gate:g}", "inflow": rules.inflow, "faults": rules.faults}
+                 "gate": f"{rules.gate:g}", "inflow": rules.inflow, "faults": rules.faults,
+                 "history": rules.history}
     return "\n".join(["| | |", "|---|---|", *(f"| {key} | `{value}` |"
                                               for key, value in rows.items())])
 

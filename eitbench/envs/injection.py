@@ -57,6 +57,7 @@ class InjectionEnv(EpisodeEnv):
     | `gate` | set by the id | the filter rejects innovations beyond this many standard deviations |
     | `inflow` | set by the id | inflow prior: "white" noise (Table 5.1), or "learned" |
     | `faults` | set by the id | electrode faults: the "gate" rejects measurements, or "estimated" |
+    | `history` | set by the id | entries of the last "steps", or of the last "injections" |
     | `variant` | None | name of a robustness variant of the id |
     | `world` | None | numbers to change, as in `{"schedule": {"budget": 20}}` |
     | `episodes` | None | episodes of unseeded resets; None: 1, 8, … up to 1000, of dev 32 |
@@ -70,9 +71,11 @@ class InjectionEnv(EpisodeEnv):
     def __init__(self, name: str, *, variant: str | None = None,
                  world: dict[str, Any] | None = None, estimator: str = "reduced",
                  observation: str = "scaled", gate: float | None = None, inflow: str | None = None,
-                 faults: str | None = None, episodes: int | None = None, split: str = "train",
+                 faults: str | None = None, history: str | None = None,
+                 episodes: int | None = None, split: str = "train",
                  render_mode: str | None = None) -> None:
-        core = make_core(name, variant, world, estimator, observation, gate, inflow, faults)
+        core = make_core(name, variant, world, estimator, observation, gate, inflow, faults,
+                         history)
         super().__init__(core, episodes, split, render_mode)
         self.rules = core.rules
 
@@ -114,11 +117,12 @@ class InjectionVectorEnv(EpisodeVectorEnv):
 
 def make_core(name: str, variant: str | None = None, world: dict[str, Any] | None = None,
               estimator: str = "reduced", observation: str = "scaled", gate: float | None = None,
-              inflow: str | None = None, faults: str | None = None) -> InjectionCore:
+              inflow: str | None = None, faults: str | None = None,
+              history: str | None = None) -> InjectionCore:
     """Return the core of an id with these arguments; ``ValueError`` names an argument that is not
     allowed."""
     registered = entry(name, variant)
-    given = {"gate": gate, "inflow": inflow, "faults": faults}
+    given = {"gate": gate, "inflow": inflow, "faults": faults, "history": history}
     settings = dict(registered.settings) | {key: value for key, value in given.items()
                                             if value is not None}
     rules = Rules(registered.world.with_changes(world), has_first_frame=estimator != "none",

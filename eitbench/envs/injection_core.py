@@ -29,8 +29,10 @@ def flatten_scaled(rules: Rules, observation: Observation) -> np.ndarray:
     and never beyond ±5.
 
     In this order: voltages, recent currents, innovations, mean and std on the grid, fault scores,
-    remaining steps and, with a budget, injections, and if the velocity is estimated, its mean and
-    standard deviation, and if a body is tracked, its estimate; the first frame is omitted.
+    remaining steps and, with a budget, injections, and if observations are of the last injections,
+    the steps since the last one, relative to the mean interval of the budget, and if the velocity
+    is estimated, its mean and standard deviation, and if a body is tracked, its estimate; the first
+    frame is omitted.
     """
     world = rules.world
     level = world.expected_concentration
@@ -40,6 +42,8 @@ def flatten_scaled(rules: Rules, observation: Observation) -> np.ndarray:
              observation["innovations"] / 3.0, 2.0 * (observation["mean"] / level - 1.0),
              observation["std"] / (world.prior.inflow_std * level), observation["doubt"],
              observation["left"] / left]
+    if rules.history == "injections":
+        parts.append(observation["waited"] * (rules.budget or world.n_steps) / world.n_steps)
     flow = world.velocity_model
     if flow is not None:
         parts += [2.0 * (observation["velocity"] / flow.nominal - 1.0),
@@ -109,6 +113,8 @@ class InjectionCore(EpisodeCore):
                       "frame": _box(largest, self.n_initial, L),
                       "innovations": _box(1e6, L), "mean": _box(mean, columns * rows),
                       "std": _box(mean, columns * rows, low=0.0), "doubt": _box(1.0, 2, L, low=0.0)}
+            if rules.history == "injections":
+                shown["waited"] = _box(world.n_steps, 1, low=0.0)
             flow = world.velocity_model
             if flow is not None:
                 fastest = 100.0 * max(flow.nominal)
@@ -138,6 +144,7 @@ class InjectionCore(EpisodeCore):
         self._voltages, self.currents = np.zeros((2, B, L))
         """V and A (A/m in 2D), (B, L) each, of the last injections"""
         self._recent = np.zeros((B, N_RECENT_CURRENTS, L))
+        self._waited = np.zeros(B, dtype=int)
         self._homogeneous: np.ndarray | None = None
         self._errors: np.ndarray | None = None
         faults = [instrument_faults(world, seed) for seed in seeds]
@@ -211,7 +218,10 @@ class InjectionCore(EpisodeCore):
         self.load_until(self.t + 1)
         self._errors = None
         self._voltages = self._measure(self.t, currents)
-        self._recent = np.concatenate([currents[:, None], self._recent[:, :-1]], axis=1)
+        injected = currents.any(axis=1)
+        self._waited = np.where(injected, 0, self._waited + 1)
+        kept = np.ones_like(injected) if self.rules.history == "steps" else injected
+        self._recent[kept] = np.concatenate([currents[:, None], self._recent[:, :-1]], axis=1)[kept]
         self.t += 1
         if not self._filters_type:
             return np.zeros(len(currents))
@@ -289,6 +299,8 @@ class InjectionCore(EpisodeCore):
         if self._filters_type:
             shown |= {"recent": self._recent.copy(), "frame": np.nan_to_num(self._frames)}
             shown |= self._filters.features()
+            if self.rules.history == "injections":
+                shown["waited"] = self._waited[:, None].astype(float)
         left = [np.full(len(self.n_injections), float(self.world.n_steps - self.t))]
         if self.rules.budget is not None:
             left.append(self.rules.budget - self.n_injections.astype(float))

@@ -55,8 +55,8 @@ Anchors = Mapping[tuple[str, str, str], Mapping[str, float]]
 """Method, world, split -> seed -> ẽ_c."""
 SPLIT_ORDER = ("test", "dev", "train", "own")
 """Order of the boards of splits."""
-_NON_WORLD_KWARGS = ("lag", "assume", "gate", "inflow", "faults", "episodes", "render_mode",
-                     "observation", "estimator")
+_NON_WORLD_KWARGS = ("lag", "assume", "gate", "inflow", "faults", "history", "episodes",
+                     "render_mode", "observation", "estimator")
 """Arguments of an environment that leave its true episodes unchanged."""
 _SKILL_SCORE = (
     "skill score", "1 − ẽ_c / ẽ_c of the naive baseline (homogeneous; random_pair) in the same "

@@ -134,7 +134,7 @@ def save_agent(model: Any, env: Any, folder: str | Path) -> Path:
                 or any(vector.env_is_wrapped(gym.wrappers.NormalizeObservation))):
             raise ValueError("model must be trained with scaled observations, got normalised ones")
     kwargs = {name: value for name, value in spec.kwargs.items()
-              if name in ("variant", "world", "gate", "inflow", "faults", "estimator")}
+              if name in ("variant", "world", "gate", "inflow", "faults", "history", "estimator")}
     core: Any = gym.make(spec.id, disable_env_checker=True, **kwargs).unwrapped
     for name in ("observation_space", "action_space"):
         expected, got = getattr(core, name), getattr(model, name)

@@ -176,7 +176,7 @@ PIPE_2D_INTERMITTENT = add_extension(
 
 PIPE_2D_BUDGET = add_injection(
     replace(PIPE_2D_INTERMITTENT, schedule=Schedule(scored_steps=180, budget=30)),
-    "Pipe2DInjectionInflowBudget", test_seeds="test:0-49", inflow="learned")
+    "Pipe2DInjectionInflowBudget", test_seeds="test:0-49", inflow="learned", history="injections")
 """The same episodes; the agent has a budget of 30 injections, one sixth of the scored steps."""
 add_injection(PIPE_2D_BUDGET, "Pipe2DInjectionBudget", test_seeds="test:0-49",
               is_starting_point=True)

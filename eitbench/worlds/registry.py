@@ -22,7 +22,8 @@ ENV_CLASSES = {
     "injection": ("eitbench.envs.injection:InjectionEnv",
                   "eitbench.envs.injection:InjectionVectorEnv")}
 """Track -> its environment and its vector environment."""
-ID_SETTINGS = {"estimation": ("lag", "assume"), "injection": ("gate", "inflow", "faults")}
+ID_SETTINGS = {"estimation": ("lag", "assume"),
+               "injection": ("gate", "inflow", "faults", "history")}
 """Track -> arguments of its environment that an id may fix, besides the world."""
 MAX_SETTINGS_BYTES = 10_000
 GROUPS = ("thesis examples", "extensions", "robustness variants", "injection", "user-defined")

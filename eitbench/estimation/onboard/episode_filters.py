@@ -81,12 +81,14 @@ class EpisodeFilters:
     def assimilate(self, voltages: np.ndarray, currents: np.ndarray) -> None:
         """Predict and condition on voltages (B, L) in V for currents (B, L) in A (A/m in 2D), all
         zero without an injection."""
-        self._innovations, accepted = self._condition(voltages, currents)
+        innovations, accepted = self._condition(voltages, currents)
         # Fault scores of each electrode: moving averages of the fraction of rejected measurements
         # at it, and of failed injections through it.
         reading = self._doubt[:, 0]
         driving = self._doubt[:, 1]
         injected = currents.any(axis=1, keepdims=True)
+        keeps_last = self._rules.history == "injections"
+        self._innovations = np.where(injected | (not keeps_last), innovations, self._innovations)
         failed = ~accepted.any(axis=1, keepdims=True)
         # A failed injection has no information on the measuring electrodes.
         reading += FAULT_EMA_WEIGHT * (injected & ~failed) * (~accepted - reading)

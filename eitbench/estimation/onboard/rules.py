@@ -17,6 +17,10 @@ from eitbench.worlds.world import World
 INFLOW_MODELS = ("white", "learned")
 """Inflow priors of the estimator: white noise (Table 5.1), or a coloured logarithm fitted to
 training episodes (``docs/methods.md``, 10)."""
+HISTORIES = ("steps", "injections")
+"""Contents of the entries ``recent`` and ``innovations`` of an observation: currents of the last
+steps and the innovation of the last one, or of the last injections; then the entry ``waited``
+counts the steps since the last injection."""
 FAULT_MODELS = ("gate", "estimated")
 """Treatment of electrode faults by the estimator: it rejects measurements beyond the gate, or
 estimates the state of each electrode (``docs/methods.md``, 19)."""
@@ -43,6 +47,8 @@ class Rules:
         Inflow prior of the estimator: Table 5.1, or fitted to training episodes.
     faults : "gate" or "estimated"
         Treatment of electrode faults by the estimator; see `FAULT_MODELS`.
+    history : "steps" or "injections"
+        Contents of observations; see `HISTORIES`.
     """
 
     world: World
@@ -50,12 +56,14 @@ class Rules:
     has_first_frame: bool = True
     inflow: str = "white"
     faults: str = "gate"
+    history: str = "steps"
 
     def __post_init__(self) -> None:
         if self.gate != np.inf:
             _check.number("gate", self.gate, low=0.0, open_low=True)
         _check.choice("inflow", self.inflow, INFLOW_MODELS)
         _check.choice("faults", self.faults, FAULT_MODELS)
+        _check.choice("history", self.history, HISTORIES)
 
     @property
     def instrument(self) -> Instrument:
@@ -103,11 +111,13 @@ class Rules:
 
     @property
     def tuning_key(self) -> str:
-        """Key of tuned values: the world's name, with suffixes for faults and a budget."""
+        """Key of tuned values: the world's name, with suffixes for faults, a budget, and a fitted
+        inflow prior with a budget."""
         estimated = "estimated " * (self.faults == "estimated")
         faults = f" with {estimated}faults" * (self.instrument.max_faulty > 0)
         budget = " with a budget" * (self.budget is not None)
-        return self.world.name + faults + budget
+        inflow = " and a fitted inflow prior" * (budget != "" and self.inflow == "learned")
+        return self.world.name + faults + budget + inflow
 
     def action(self, pair: int | None) -> Any:
         """Return the action that injects through the pair of this number, or nothing (None, which
