@@ -7,6 +7,7 @@ import math
 from typing import Any
 
 import numpy as np
+from scipy.optimize import linear_sum_assignment
 from scipy.special import ndtr, ndtri
 
 
@@ -95,17 +96,37 @@ def deficit_centroid(values: np.ndarray, points: np.ndarray, weights: np.ndarray
     return centre
 
 
-def ospa(distances: np.ndarray, estimated: np.ndarray, present: np.ndarray,
+def ospa(estimates: np.ndarray, estimated: np.ndarray, truths: np.ndarray, present: np.ndarray,
          cutoff: float) -> float:
-    """Compute the root mean square of the OSPA distance in m of one body over T states
-    (Schuhmacher, Vo & Vo, IEEE Trans. Signal Process. 56, 2008, order 2).
+    """Compute the root mean square of the OSPA distance in m over T states (Schuhmacher, Vo & Vo,
+    IEEE Trans. Signal Process. 56, 2008, order 2).
 
-    It is the position error ``distances`` (T,) in m, at most ``cutoff`` in m, where the body is
-    ``estimated`` to be present and is ``present`` (T,), and the cutoff where only one is true.
+    In a state, n is the larger of the numbers of bodies that are ``estimated`` to be present
+    (T, k) and that are ``present`` (T, k). The distance is the root of the mean over n of the
+    squared position errors, at most ``cutoff`` in m, of ``estimates`` and ``truths`` (T, k, d) in m
+    after the best assignment, and of the squared cutoff for each missed or false body.
     """
-    both = np.where(estimated & present, np.minimum(distances, cutoff), 0.0)
-    errors = np.where(estimated != present, cutoff, both)
-    return float(np.sqrt((errors**2).mean()))
+    squares = []
+    for claimed, exists, estimate, truth in zip(estimated, present, estimates, truths,
+                                                strict=True):
+        matched = _matched(estimate[claimed], truth[exists], cutoff)
+        n = max(claimed.sum(), exists.sum())
+        squares.append(((matched**2).sum() + (n - len(matched)) * cutoff**2) / max(n, 1))
+    return math.sqrt(np.mean(squares))
+
+
+def matched_distances(estimates: np.ndarray, truths: np.ndarray,
+                      present: np.ndarray) -> np.ndarray:
+    """Compute the distances (n,) in m of all ``present`` bodies (T, k) from the ``estimates``, with
+    the best assignment of all estimates in each state; arguments as in `ospa`."""
+    return np.concatenate([_matched(estimate, truth[exists]) for estimate, truth, exists
+                           in zip(estimates, truths, present, strict=True)])
+
+
+def _matched(estimates: np.ndarray, truths: np.ndarray, cutoff: float = np.inf) -> np.ndarray:
+    """Return the distances, at most ``cutoff``, of the assignment with the least sum of squares."""
+    distances = np.minimum(np.linalg.norm(estimates[:, None] - truths, axis=-1), cutoff)
+    return np.asarray(distances[linear_sum_assignment(distances**2)])
 
 
 def _pair(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

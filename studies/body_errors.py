@@ -39,7 +39,7 @@ def parts_of_error(env: Any, policy: str) -> np.ndarray:
             observation, *_ = env.step(acting.act(observation))
             if t <= core.world.warm_up:
                 continue
-            distance = np.linalg.norm(core.body()[0, :2] - body.centres[t])
+            distance = np.linalg.norm(core.bodies()[0, 0, :2] - body.centres[t])
             is_new = not body.present[max(t - NEW_STEPS, 0):t + 1].all()
             part = (0 if not body.present[t] else
                     1 if is_new else 2 + int(np.searchsorted(LIMITS, distance)))
@@ -57,7 +57,7 @@ def image_error(env: Any) -> float:
         filters = core._filters.filter
         core.load_until(core.world.n_steps)
         for t in range(core.world.warm_up + 1, core.world.n_steps + 1):
-            for values, true in zip(filters.particles, (
+            for values, true in zip(filters.bodies[0].particles, (
                     body.centres[t], 0.0, (body.radius / filters.model.radius)**2,
                     body.present[t]), strict=True):
                 values[:] = true

@@ -1,5 +1,7 @@
 """Scores against integrals by hand, definitions by quadrature, and random draws."""
 
+import itertools
+
 import numpy as np
 import pytest
 import scipy.integrate
@@ -9,6 +11,7 @@ from eitbench.scoring import (
     coverage,
     crps,
     deficit_centroid,
+    matched_distances,
     normalised_innovations,
     normalised_score,
     ospa,
@@ -151,10 +154,33 @@ def test_arrays_must_be_a_pair_over_time_and_space(score, left, right):
 def test_ospa_of_one_body():
     """A body is estimated 1, 50 and 3 mm off, then missed; of two absent ones the first is estimated to be
     present: √((1 + 1600 + 9 + 1600 + 1600 + 0)/6) mm."""
-    distances = 1e-3 * np.array([1.0, 50.0, 3.0, 2.0, 10.0, 100.0])
-    estimated = np.array([True, True, True, False, True, False])
-    present = np.array([True, True, True, True, False, False])
-    assert ospa(distances, estimated, present, 0.04) == pytest.approx(1e-3 * (4810 / 6)**0.5)
+    truths = np.full((6, 1, 2), 0.1)
+    estimates = truths + 1e-3 * np.array([1.0, 50.0, 3.0, 2.0, 10.0, 100.0])[:, None, None] * [[[0.6, -0.8]]]
+    estimated = np.array([True, True, True, False, True, False])[:, None]
+    present = np.array([True, True, True, True, False, False])[:, None]
+    assert ospa(estimates, estimated, truths, present, 0.04) == pytest.approx(1e-3 * (4810 / 6)**0.5)
+    np.testing.assert_allclose(matched_distances(estimates, truths, present), [1e-3, 0.05, 3e-3, 2e-3], rtol=1e-9)
+
+
+def test_ospa_of_several_bodies_is_that_of_the_best_assignment():
+    """All assignments of the definition: of two, three and four bodies, in any order, missed and false ones."""
+    random = np.random.default_rng(0)
+    cutoff, squares, distances = 0.3, [], []
+    states = [(random.uniform(size=(4, 2)), random.uniform(size=4) < 0.6, random.uniform(size=(4, 2)),
+               random.uniform(size=4) < 0.6) for _ in range(30)]
+    for estimate, claimed, truth, exists in states:
+        few, many = sorted((estimate[claimed], truth[exists]), key=len)
+        n = len(many)
+        least = min((sum(min(np.hypot(*(a - many[k])), cutoff)**2 for a, k in zip(few, order, strict=False))
+                     for order in itertools.permutations(range(n))), default=0.0)
+        squares.append((least + cutoff**2 * (n - len(few))) / max(n, 1))
+        true = truth[exists]
+        best = min(itertools.permutations(range(4), len(true)),
+                   key=lambda order: sum(((estimate[list(order)] - true)**2).sum(axis=1)))
+        distances += np.hypot(*(estimate[list(best)] - true).T).tolist()
+    estimates, claimed, truths, exists = (np.array(each) for each in zip(*states, strict=True))
+    assert ospa(estimates, claimed, truths, exists, cutoff) == pytest.approx(np.mean(squares)**0.5, rel=1e-9)
+    assert sorted(matched_distances(estimates, truths, exists)) == pytest.approx(sorted(distances), rel=1e-9)
 
 
 def plate():

@@ -19,13 +19,16 @@ class Policy(CyclePolicy):
         "cycle": {"Pipe2D": [[0, 8]], "Pipe2D with faults": [[8, 11], [0, 4], [2, 8], [0, 14]],
                   "Pipe2D with estimated faults": [[0, 8], [2, 8], [0, 11]],
                   "Pipe2DIntermittent with a budget": [[0, 10]],
+                  "Pipe2DIntermittent with a budget and a fitted inflow prior": [[0, 9]],
                   "Pipe2DDriftingVelocity": [[7, 8], [1, 7]], "RotatingTank2D": [[9, 15]],
                   "TankTracking": ROTATION, "SearchAndTrack": [[4, 13], [3, 14], [0, 10]],
                   "BubbleTracking": [[2, 10], [4, 12], [2, 10]]},
         "environment_steps": {
             "Pipe2D": 346_368, "Pipe2D with faults": 608_768,
             "Pipe2D with estimated faults": 467_072,
-            "Pipe2DIntermittent with a budget": 768_768, "Pipe2DDriftingVelocity": 217_792,
+            "Pipe2DIntermittent with a budget": 768_768,
+            "Pipe2DIntermittent with a budget and a fitted inflow prior": 768_768,
+            "Pipe2DDriftingVelocity": 217_792,
             "RotatingTank2D": 333_696, "TankTracking": 712_704, "SearchAndTrack": 712_704,
             "BubbleTracking": 1_127_424}}
 

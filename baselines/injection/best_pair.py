@@ -12,13 +12,17 @@ class Policy(CyclePolicy):
     parameters: dict[str, Any] = {  # noqa: RUF012
         "pair": {"Pipe2D": [0, 8], "Pipe2D with faults": [0, 8],
                  "Pipe2D with estimated faults": [0, 8],
-                 "Pipe2DIntermittent with a budget": [0, 10], "Pipe2DDriftingVelocity": [7, 9],
+                 "Pipe2DIntermittent with a budget": [0, 10],
+                 "Pipe2DIntermittent with a budget and a fitted inflow prior": [0, 9],
+                 "Pipe2DDriftingVelocity": [7, 9],
                  "RotatingTank2D": [9, 15], "TankTracking": [8, 14],
                  "SearchAndTrack": [2, 12], "BubbleTracking": [2, 10]},
         "environment_steps": {
             "Pipe2D": 314_880, "Pipe2D with faults": 314_880,
             "Pipe2D with estimated faults": 314_880,
-            "Pipe2DIntermittent with a budget": 698_880, "Pipe2DDriftingVelocity": 157_440,
+            "Pipe2DIntermittent with a budget": 698_880,
+            "Pipe2DIntermittent with a budget and a fitted inflow prior": 698_880,
+            "Pipe2DDriftingVelocity": 157_440,
             "RotatingTank2D": 303_360, "TankTracking": 368_640, "SearchAndTrack": 368_640,
             "BubbleTracking": 368_640}}
 

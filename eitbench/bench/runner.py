@@ -227,16 +227,19 @@ def _run_policy(env: InjectionEnv, policy: Method, seed: int) -> EpisodeRun:
         if (error := env.error) is not None:
             means, stds = env.core.estimate()
             scored.append((t, error, means[0], stds[0], env.core.innovations()[0],
-                           env.core.body()))
-    states, errors, mean, std, innovations, bodies = zip(*scored, strict=True)
+                           env.core.bodies()))
+    states, errors, mean, std, innovations, estimates = zip(*scored, strict=True)
     world = env.core.world
     distances = ospa = None
     if env.rules.tracks_body:
-        path = world.target.path(world, episode_streams(seed).flow)
-        body, present = np.concatenate(bodies), path.present[list(states)]
-        off = np.hypot(*(body[:, :2] - path.centres[list(states)]).T)
-        distances = off[present] if present.any() else None
-        ospa = scoring.ospa(off, body[:, -1] >= 0.5, present, LOST_DISTANCE)
+        paths = world.target.paths(world, episode_streams(seed).flow)
+        centres, present = (np.stack(each, axis=1)[list(states)] for each in (
+            [path.centres for path in paths], [path.present for path in paths]))
+        bodies = np.concatenate(estimates)
+        if present.any():
+            distances = scoring.matched_distances(bodies[..., :2], centres, present)
+        ospa = scoring.ospa(bodies[..., :2], bodies[..., -1] >= 0.5, centres, present,
+                            LOST_DISTANCE)
     interpolation, mass = region_operators(world)
     used = [each for each in innovations if each is not None]       # None: all were rejected
     outcome = Outcome(

@@ -65,9 +65,9 @@ class Outcome:
     solute_flow: tuple[np.ndarray, np.ndarray] | None = None
     """(S,) estimated and true flow of solute through a pipe's outlet, mol/s (mol/(s·m) in 2D)"""
     distances: np.ndarray | None = None
-    """m, between the estimated and the true position in each scored state with a body"""
+    """m, between the estimated and the true position of each body in each scored state"""
     ospa: float | None = None
-    """m, `scoring.ospa` of a body with the cutoff `LOST_DISTANCE`"""
+    """m, `scoring.ospa` of the bodies with the cutoff `LOST_DISTANCE`"""
     mean_nis: float | None = None
     """NIS/m of measurements"""
     ktc: float | None = None

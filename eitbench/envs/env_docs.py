@@ -31,7 +31,7 @@ KEY_DESCRIPTIONS = {
              "broken wire and of a bad contact",
     "velocity": "estimated mean velocity, m/s",
     "velocity_std": "standard deviation of the velocity, m/s",
-    "body": f"estimate of the body, given that it is present: {'; '.join(BODY)}",
+    "body": f"estimate of each body, given that it is present: {'; '.join(BODY)}",
     "waited": "steps since the last injection",
     "left": "remaining steps and, with a budget, remaining injections",
 }

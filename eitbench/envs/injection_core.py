@@ -31,8 +31,8 @@ def flatten_scaled(rules: Rules, observation: Observation) -> np.ndarray:
     In this order: voltages, recent currents, innovations, mean and std on the grid, fault scores,
     remaining steps and, with a budget, injections, and if observations are of the last injections,
     the steps since the last one, relative to the mean interval of the budget, and if the velocity
-    is estimated, its mean and standard deviation, and if a body is tracked, its estimate; the first
-    frame is omitted.
+    is estimated, its mean and standard deviation, and if bodies are tracked, their estimates; the
+    first frame is omitted.
     """
     world = rules.world
     level = world.expected_concentration
@@ -51,7 +51,8 @@ def flatten_scaled(rules: Rules, observation: Observation) -> np.ndarray:
     if rules.tracks_body:
         centre, speed = world.target.limits(world)
         spread = world.target.radius_range[1]
-        parts.append(observation["body"] / (*centre, speed, speed, spread, spread, 1.0, 1.0, 1.0))
+        scale = *centre, speed, speed, spread, spread, 1.0, 1.0, 1.0
+        parts.append(observation["body"] / np.tile(scale, world.target.n_bodies))
     batch = observation["voltages"].shape[:-1]
     flat = np.concatenate([part.reshape(*batch, -1) for part in parts], axis=-1)
     return np.clip(flat, -MAX_SCALED, MAX_SCALED).astype(np.float32)
@@ -121,7 +122,7 @@ class InjectionCore(EpisodeCore):
                 shown |= {"velocity": _box(fastest, flow.n_parameters),
                           "velocity_std": _box(fastest, flow.n_parameters, low=0.0)}
             if rules.tracks_body:
-                shown["body"] = _box(1e3, len(BODY))
+                shown["body"] = _box(1e3, world.target.n_bodies * len(BODY))
         left = [world.n_steps] if rules.budget is None else [world.n_steps, rules.budget]
         shown["left"] = spaces.Box(np.zeros(len(left)), np.array(left, dtype=float),
                                    dtype=np.float64)
@@ -277,9 +278,9 @@ class InjectionCore(EpisodeCore):
         agents; None without an injection or an accepted measurement."""
         return self._filters.innovations()
 
-    def body(self) -> np.ndarray | None:
-        """Return the estimated `BODY` of each episode (B, 9); None without a body."""
-        return self._filters.body()
+    def bodies(self) -> np.ndarray | None:
+        """Return the estimated `BODY` of each body in each episode (B, bodies, 9); None without."""
+        return self._filters.bodies()
 
     def action_masks(self) -> np.ndarray:
         """Return (B, actions) bool: actions that have an effect. When the budget is used up, only

@@ -1,4 +1,4 @@
-"""Particle filters of the position of a moving body, for batches of episodes."""
+"""Particle filters of the positions of moving bodies, for batches of episodes."""
 
 from __future__ import annotations
 
@@ -25,6 +25,8 @@ PROPOSED_ENTRIES = 0.5
 """Fraction of the absent particles that enter in a time step. Weights correct for the true rate,
 with which few particles would find a body that has just entered."""
 PARTICLES = 2048
+SWEEPS = 2
+"""Number of sweeps over the bodies at each measurement."""
 SEED = 0
 
 
@@ -39,6 +41,17 @@ class Particles(NamedTuple):
     """(B, P) area of the body relative to the mean one"""
     present: np.ndarray
     """(B, P) bool: whether the body is in the vessel"""
+
+
+class Injection(NamedTuple):
+    """Injections of B episodes."""
+
+    currents: np.ndarray
+    """(B, L) A (A/m in 2D)"""
+    electrodes: np.ndarray
+    """(B, m) that contain the measured ones"""
+    used: np.ndarray
+    """(B, m) bool: whether an electrode is measured"""
 
 
 class BodyModel:
@@ -144,11 +157,9 @@ class BodyModel:
                           1e-3 * np.abs(voltages).max(axis=-1, keepdims=True))
 
 
-class BodyParticleFilter:
-    """Particle filters of B episodes: proposals from the motion with more entries, systematic
+class BodyParticles:
+    """Particles of one body in B episodes: proposals from the motion with more entries, systematic
     resampling.
-
-    The concentration of the liquid is known. Random numbers are the same in all episodes.
 
     Parameters
     ----------
@@ -156,66 +167,64 @@ class BodyParticleFilter:
     episodes : int
         B.
     n_particles : int
+    random : Generator
+        Its numbers are the same in all episodes.
 
     Attributes
     ----------
     particles, weights
         Present particles and their weights (B, P).
-    innovation : tuple
-        Last innovation (B, m) in V, its covariance (B, m, m) in V², and the mask (B, m) of its
-        measured entries.
     """
 
-    def __init__(self, model: BodyModel, episodes: int, n_particles: int = PARTICLES) -> None:
+    def __init__(self, model: BodyModel, episodes: int, n_particles: int,
+                 random: np.random.Generator) -> None:
         self.model = model
-        self._random = np.random.default_rng(SEED)
         P = self.n_particles = n_particles
         centres, velocities, areas = (np.repeat(each[None], episodes, axis=0)
-                                      for each in model.draw(self._random, P))
+                                      for each in model.draw(random, P))
         self.particles = Particles(centres, velocities, areas, np.ones((episodes, P), dtype=bool))
         self.weights = np.full((episodes, P), 1.0 / P)
         self._density: np.ndarray | None = None
 
-    def repeat(self, count: int) -> BodyParticleFilter:
-        """Return filters of ``count`` copies of the first episode."""
+    def repeat(self, count: int) -> BodyParticles:
+        """Return ``count`` copies of the first episode."""
         copies = copy(self)
-        copies._random = deepcopy(self._random)
         copies.particles = Particles(*(np.repeat(each[:1], count, axis=0)
                                        for each in self.particles))
         copies.weights = np.repeat(self.weights[:1], count, axis=0)
         return copies
 
-    def assimilate(self, voltages: np.ndarray, currents: np.ndarray,
-                   measured: np.ndarray) -> np.ndarray:
-        """Predict and condition on voltages (B, L) in V for currents (B, L), where ``measured``
-        (B, L); return the innovations (B, L) in predicted standard deviations."""
-        model = self.model
-        self.particles, self.weights = model.move(self.particles, self.weights, self._random)
-        electrodes, used = measured_first(measured & currents.any(axis=1, keepdims=True))
-        base = (currents[:, None] @ model.resistance)[:, 0]     # one product per episode
-        std, residual = (np.take_along_axis(each, electrodes, axis=1)
-                         for each in (model.noise_std(base), voltages - base))
-        log_likelihood = np.zeros(self.weights.shape)
-        innovation = np.zeros(residual.shape)
-        S = ~used[:, None] * np.eye(used.shape[1])
-        compiled_kernels().particle_likelihoods(
-            model.signals, *model.cells(self.particles), self.weights, currents, electrodes, used,
-            residual, std**2, model.motion.signal_error, log_likelihood, innovation, S)
-        self.innovation = innovation, S, used
-        self._reweight(log_likelihood)
-        scaled = np.zeros(voltages.shape)
-        np.put_along_axis(scaled, electrodes, innovation / np.sqrt(
-            S.diagonal(axis1=1, axis2=2)), axis=1)
-        return scaled
+    def move(self, random: np.random.Generator) -> None:
+        """Move the particles by a time step."""
+        self.particles, self.weights = self.model.move(self.particles, self.weights, random)
 
-    def _reweight(self, log_likelihood: np.ndarray) -> None:
+    def likelihoods(self, weights: np.ndarray, injection: Injection, residual: np.ndarray,
+                    variance: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return the log-likelihoods (B, P) of a ``residual`` (B, m) in V with this noise
+        ``variance`` (B, m), and for these ``weights`` of the particles (B, P) the mean (B, m) and
+        covariance (B, m, m) of what the residual and its noise leave."""
+        log_likelihood = np.zeros(weights.shape)
+        mean = np.zeros(residual.shape)
+        S = ~injection.used[:, None] * np.eye(residual.shape[1])
+        model = self.model
+        compiled_kernels().particle_likelihoods(
+            model.signals, *model.cells(self.particles), weights, *injection, residual, variance,
+            model.motion.signal_error, log_likelihood, mean, S)
+        return log_likelihood, mean, S
+
+    def posterior(self, log_likelihood: np.ndarray) -> np.ndarray:
+        """Return the weights (B, P) after a measurement with these log-likelihoods (B, P)."""
         log_weights = np.log(np.maximum(self.weights, 1e-300)) + log_likelihood
         weights = np.exp(log_weights - log_weights.max(axis=1, keepdims=True))
-        self.weights = weights / weights.sum(axis=1, keepdims=True)
+        return np.asarray(weights / weights.sum(axis=1, keepdims=True))
+
+    def reweight(self, weights: np.ndarray, random: np.random.Generator) -> None:
+        """Set the weights (B, P), and resample the episodes with few effective particles."""
+        self.weights = weights
         self._density = None
         P = self.n_particles
-        offset = self._random.uniform()
-        jitter = POSITION_JITTER * self._random.standard_normal((P, 2))
+        offset = random.uniform()
+        jitter = POSITION_JITTER * random.standard_normal((P, 2))
         places = (np.arange(P) + offset) / P
         for b in np.flatnonzero((self.weights**2).sum(axis=1) * P > 2.0):
             chosen = np.minimum(np.searchsorted(self.weights[b].cumsum(), places), P - 1)
@@ -225,7 +234,8 @@ class BodyParticleFilter:
             self.weights[b] = 1.0 / P
 
     def _densities(self) -> np.ndarray:
-        """Return the posterior means (2, B, G) on the grid of a body's area, and of its square."""
+        """Return the posterior means (2, B, G) on the grid of the body's area, and of its square.
+        """
         index, shares = self.model.cells(self.particles)
         densities = np.zeros((2, len(self.weights), self.model.signals.shape[1]))
         flat = index.reshape(len(self.weights), -1)
@@ -238,10 +248,10 @@ class BodyParticleFilter:
         """Return the mean (B, m) of functionals (m, G) of the body's image on the grid."""
         return self._expectations(images, 1)
 
-    def std(self, images: sp.csc_array) -> np.ndarray:
-        """Return the standard deviation (B, m) of functionals (m, G)."""
+    def variance(self, images: sp.csc_array) -> np.ndarray:
+        """Return the variance (B, m) of functionals (m, G)."""
         variance = self._expectations(images, 2) - self._expectations(images, 1)**2
-        return np.sqrt(np.maximum(variance, 0.0))
+        return np.maximum(variance, 0.0)
 
     def _expectations(self, images: sp.csc_array, moment: int) -> np.ndarray:
         """Return the expectation (B, m) of functionals of the body to the power of ``moment``."""
@@ -252,7 +262,7 @@ class BodyParticleFilter:
                                        self._density[moment - 1], found)
         return found
 
-    def body(self) -> np.ndarray:
+    def summary(self) -> np.ndarray:
         """Return the estimated `BODY` of each episode, (B, 9)."""
         centres, velocities, areas, present = self.particles
         weights = self.weights * present
@@ -266,6 +276,102 @@ class BodyParticleFilter:
         correlation = covariance[:, 0, 1] / np.maximum(std.prod(axis=1), 1e-300)
         return np.concatenate([position, velocity, std, correlation[:, None], area, presence],
                               axis=1)
+
+
+class BodyParticleFilter:
+    """Particle filters of B episodes with one or several bodies.
+
+    The concentration of the liquid is known. Signals of bodies add up, and the posterior is
+    approximated by a product over the bodies (mean field): the measurement of a body is the voltage
+    minus the mean signals of the others, whose variances add to the noise. Each body in turn is
+    conditioned on it, `SWEEPS` times.
+
+    Parameters
+    ----------
+    model : BodyModel
+    episodes : int
+        B.
+    n_particles : int
+        Particles of each body.
+
+    Attributes
+    ----------
+    bodies : list of BodyParticles
+    innovation : tuple
+        Last innovation (B, m) in V, its covariance (B, m, m) in V², and the mask (B, m) of its
+        measured entries.
+    """
+
+    def __init__(self, model: BodyModel, episodes: int, n_particles: int = PARTICLES) -> None:
+        self.model = model
+        self._random = np.random.default_rng(SEED)
+        self.bodies = [BodyParticles(model, episodes, n_particles, self._random)
+                       for _ in range(model.target.n_bodies)]
+
+    def repeat(self, count: int) -> BodyParticleFilter:
+        """Return filters of ``count`` copies of the first episode."""
+        copies = copy(self)
+        copies._random = deepcopy(self._random)
+        copies.bodies = [each.repeat(count) for each in self.bodies]
+        return copies
+
+    def assimilate(self, voltages: np.ndarray, currents: np.ndarray,
+                   measured: np.ndarray) -> np.ndarray:
+        """Predict and condition on voltages (B, L) in V for currents (B, L), where ``measured``
+        (B, L); return the innovations (B, L) in predicted standard deviations."""
+        model = self.model
+        for body in self.bodies:
+            body.move(self._random)
+        injection = Injection(currents,
+                              *measured_first(measured & currents.any(axis=1, keepdims=True)))
+        base = (currents[:, None] @ model.resistance)[:, 0]     # one product per episode
+        std, residual = (np.take_along_axis(each, injection.electrodes, axis=1)
+                         for each in (model.noise_std(base), voltages - base))
+        posteriors, innovation, S = self._posteriors(injection, residual, std**2)
+        self.innovation = innovation, S, injection.used
+        for body, weights in zip(self.bodies, posteriors, strict=True):
+            body.reweight(weights, self._random)
+        scaled = np.zeros(voltages.shape)
+        np.put_along_axis(scaled, injection.electrodes, innovation / np.sqrt(
+            S.diagonal(axis1=1, axis2=2)), axis=1)
+        return scaled
+
+    def _posteriors(self, injection: Injection, residual: np.ndarray, noise: np.ndarray,
+                    ) -> tuple[list[np.ndarray], np.ndarray, np.ndarray]:
+        """Return the weights (B, P) of each body after a measurement of the ``residual`` (B, m) in
+        V with the variance ``noise`` (B, m), and its innovation and covariance."""
+        weights = [body.weights for body in self.bodies]
+        alone = [body.likelihoods(body.weights, injection, residual, noise)
+                 for body in self.bodies]
+        others = len(alone) - 1
+        used = injection.used
+        without = np.where(used, noise, 1.0)[..., None] * np.eye(used.shape[1])
+        innovation = sum(mean for _, mean, _ in alone) - others * used * residual
+        S = sum(S for *_, S in alone) - others * without
+        if not others:
+            return [self.bodies[0].posterior(alone[0][0])], innovation, S
+        for _ in range(SWEEPS):
+            for k, body in enumerate(self.bodies):
+                rest, variance = residual, noise
+                for _, mean, covariance in alone[:k] + alone[k + 1:]:
+                    rest = rest - (residual - mean)
+                    variance = variance + (covariance.diagonal(axis1=1, axis2=2) - noise)
+                weights[k] = body.posterior(
+                    body.likelihoods(body.weights, injection, rest, variance)[0])
+                alone[k] = body.likelihoods(weights[k], injection, residual, noise)
+        return weights, innovation, S
+
+    def mean(self, images: sp.csc_array) -> np.ndarray:
+        """Return the mean (B, m) of functionals (m, G) of the bodies' image on the grid."""
+        return np.asarray(sum(body.mean(images) for body in self.bodies))
+
+    def variance(self, images: sp.csc_array) -> np.ndarray:
+        """Return the variance (B, m) of functionals (m, G)."""
+        return np.asarray(sum(body.variance(images) for body in self.bodies))
+
+    def summaries(self) -> np.ndarray:
+        """Return the estimated `BODY` of each body in each episode, (B, bodies, 9)."""
+        return np.stack([body.summary() for body in self.bodies], axis=1)
 
 
 def measured_first(measured: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -291,9 +397,9 @@ class BodyTracker:
         """Return the present state; ``ValueError`` for an earlier one."""
         if lag:
             raise ValueError(f"lag must be 0 for a particle filter, got {lag}")
-        images = self._filter.model.images
-        innovation, S, _ = self._filter.innovation
-        return Estimate(self._level + self._filter.mean(images)[0], self._filter.std(images)[0]**2,
+        found, images = self._filter, self._filter.model.images
+        innovation, S, _ = found.innovation
+        return Estimate(self._level + found.mean(images)[0], found.variance(images)[0],
                         innovation[0], S[0])
 
 

@@ -5,13 +5,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from eitbench import _check
-from eitbench.worlds.fields import check_positive, check_ranges
+from eitbench.worlds.fields import ADDED_LATER, check_positive, check_ranges
 from eitbench.worlds.world import Discretisation, Target, TruthTrajectory, World
 
 if TYPE_CHECKING:
@@ -64,15 +64,19 @@ class Disc(Body):
     """mol/m³"""
 
     def path(self, world: World, random: np.random.Generator) -> BodyPath:
-        """Draw the path of an episode."""
+        """Draw the path of one body in an episode."""
         raise NotImplementedError
+
+    def paths(self, world: World, random: np.random.Generator) -> list[BodyPath]:
+        """Draw the paths of all bodies of an episode."""
+        return [self.path(world, random)]
 
     def states(self, world: World, points: np.ndarray, random: np.random.Generator,
                last: int) -> np.ndarray:
-        centres, present, radius = self.path(world, random)
-        disc = np.array([there * disc_indicator(points, centre, radius, TRANSITION_WIDTH)
-                         for centre, there in zip(centres[:last + 1], present, strict=False)])
-        return self.background + (self.concentration - self.background) * disc
+        discs = np.max([[there * disc_indicator(points, centre, radius, TRANSITION_WIDTH)
+                         for centre, there in zip(centres[:last + 1], present, strict=False)]
+                        for centres, present, radius in self.paths(world, random)], axis=0)
+        return self.background + (self.concentration - self.background) * discs
 
 
 @dataclass(frozen=True)
@@ -128,7 +132,8 @@ class ResistiveDisc(Disc):
 
 @dataclass(frozen=True)
 class MovingBody(Disc):
-    """A resistive disc that moves by itself and may be absent; filters estimate its position."""
+    """Resistive discs that move by themselves, each independently of the others, and may be absent;
+    filters estimate their positions. Discs may overlap."""
 
     background: float = 30.0
     """mol/m³, about 0.3 S/m: weak saline"""
@@ -136,10 +141,16 @@ class MovingBody(Disc):
     """m"""
     concentration: float = 1.5
     """mol/m³: a twentieth of the background, because a P1 conductivity has to stay positive"""
+    n_bodies: int = field(default=1, metadata=ADDED_LATER)
+    """number of discs, 1 to 4"""
 
     def __post_init__(self) -> None:
         check_positive(self, background="mol/m³", concentration="mol/m³")
         check_ranges(self, radius_range="m")
+        _check.integer("n_bodies", self.n_bodies, low=1, high=4)
+
+    def paths(self, world: World, random: np.random.Generator) -> list[BodyPath]:
+        return [self.path(world, random) for _ in range(self.n_bodies)]
 
     def limits(self, world: World) -> tuple[tuple[float, float], float]:
         """Return the largest coordinates in m and the largest speed in m/s, for scaling."""
@@ -208,15 +219,16 @@ class WanderingBody(MovingBody):
 
 @dataclass(frozen=True)
 class RisingBubble(MovingBody):
-    """Insulating bubbles that rise through a vertical plane pipe, one after the other.
+    """Insulating bubbles that rise through a vertical plane pipe, in ``n_bodies`` sequences, each
+    of one bubble after the other.
 
-    Each follows the nominal flow with its own slip velocity and oscillates across the pipe. It
-    enters at a random y, a random time after the last one has left, and leaves when it reaches the
-    outlet. All numbers [E].
+    Each bubble follows the nominal flow with its own slip velocity and oscillates across the pipe.
+    It enters at a random y, a random time after the last one of its sequence has left, and leaves
+    when it reaches the outlet. All numbers [E].
     """
 
     radius_range: tuple[float, float] = (0.008, 0.012)
-    """m, of all bubbles of an episode"""
+    """m, of all bubbles of a sequence"""
     slip_range: tuple[float, float] = (0.05, 0.5)
     """m/s, velocity relative to the flow along the pipe"""
     amplitude_range: tuple[float, float] = (0.0, 0.012)

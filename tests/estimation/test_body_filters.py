@@ -16,6 +16,7 @@ from eitbench.worlds import entry
 from eitbench.worlds.bodies import TRANSITION_WIDTH, disc_indicator
 from eitbench.worlds.random_streams import episode_streams
 from eitbench.worlds.task import make_task
+from scipy.special import softmax
 
 from short import world as short_world
 
@@ -46,9 +47,9 @@ def test_signals_are_those_of_the_complete_electrode_model(distance, limit):
     with_body = liquid + (target.concentration - target.background) * disc
     expected = np.subtract(*(truth.observation.transfer_resistance(c) for c in (with_body, liquid)))
     filters = BodyParticleFilter(model, 1, 1)
-    filters.particles.centres[:] = centre
-    filters.particles.areas[:] = 1.0
-    index, weights = (each[0, 0] for each in model.cells(filters.particles))
+    filters.bodies[0].particles.centres[:] = centre
+    filters.bodies[0].particles.areas[:] = 1.0
+    index, weights = (each[0, 0] for each in model.cells(filters.bodies[0].particles))
     found = (model.signals[:, index] @ weights).reshape(16, 16)
     scale = (found * expected).sum() / (found**2).sum()          # the effective area is estimated
     assert np.linalg.norm(scale * found - expected) < limit * np.linalg.norm(expected)
@@ -60,19 +61,19 @@ def test_weights_are_those_of_bayes_formula():
     relative to the density of the noise, and the moments of the innovation."""
     core, _ = believed()
     filters, rules = core._filters.filter, core.rules
-    filters.weights[:] = 1.0 / filters.n_particles
+    filters.bodies[0].weights[:] = 1.0 / filters.bodies[0].n_particles
     pair = 57
     (i, j), amplitude = rules.pairs[pair], rules.amplitude
-    resampled, filters._reweight = [], lambda log: resampled.append(log[0])
+    found, filters.bodies[0].reweight = [], lambda weights, random: found.append(weights[0])
     core.act(np.array([pair]))
     model = filters.model
     base = amplitude * (model.resistance[i] - model.resistance[j])
     measured = [k for k in ((i - 1) % 16, (i + 1) % 16, (j - 1) % 16, (j + 1) % 16) if k not in (i, j)]
     std = model.noise_std(base)[measured]
-    expected = np.empty(filters.n_particles)
+    expected = np.empty(filters.bodies[0].n_particles)
     residuals, variances = [], []
-    index, weights = (each[0] for each in model.cells(filters.particles))
-    for p in range(filters.n_particles):
+    index, weights = (each[0] for each in model.cells(filters.bodies[0].particles))
+    for p in range(filters.bodies[0].n_particles):
         change = (model.signals[:, index[p]] @ weights[p]).reshape(16, 16)
         signal = amplitude * (change[:, i] - change[:, j])[measured]
         variance = std**2 + (model.motion.signal_error * signal)**2
@@ -80,7 +81,7 @@ def test_weights_are_those_of_bayes_formula():
         residuals.append(residual)
         variances.append(variance)
         expected[p] = -0.5 * (residual**2 / variance + np.log(variance / std**2)).sum()
-    np.testing.assert_allclose(resampled[0], expected, rtol=1e-9)
+    np.testing.assert_allclose(found[0], softmax(expected), rtol=1e-9)
     (innovation,) = core.innovations()
     order = [sorted(measured).index(k) for k in measured]
     np.testing.assert_allclose(innovation.value[order], np.mean(residuals, axis=0), rtol=1e-9, atol=1e-12)
@@ -95,7 +96,7 @@ def test_criteria_are_those_of_a_gaussian_of_images_and_voltages():
     filters, rules = belief._filters.filter, belief.rules
     model = filters.model
     gains, information = belief.criteria()
-    particles, (w,) = model.move(filters.particles, filters.weights, np.random.default_rng(1))
+    particles, (w,) = model.move(filters.bodies[0].particles, filters.bodies[0].weights, np.random.default_rng(1))
     index, share = (each[0] for each in model.cells(particles))
     images = np.array([belief._filters.patches[:, index[p]] @ share[p] for p in range(len(w))])
     changes = np.array([model.signals[:, index[p]] @ share[p] for p in range(len(w))]).reshape(-1, 16, 16)
@@ -117,11 +118,11 @@ def test_criteria_are_those_of_a_gaussian_of_images_and_voltages():
 def test_body_has_the_moments_of_the_particles_that_are_present():
     core, _ = believed("eitbench/SearchAndTrack-v0")
     filters, random = core._filters.filter, np.random.default_rng(0)
-    filters.weights[:] = random.dirichlet(np.ones(filters.n_particles))
-    filters.particles.present[:] = random.uniform(size=filters.n_particles) < 0.3
-    present = filters.particles.present[0]
-    centres, velocities, areas = (each[0, present] for each in filters.particles[:3])
-    w = filters.weights[0, present]
+    filters.bodies[0].weights[:] = random.dirichlet(np.ones(filters.bodies[0].n_particles))
+    filters.bodies[0].particles.present[:] = random.uniform(size=filters.bodies[0].n_particles) < 0.3
+    present = filters.bodies[0].particles.present[0]
+    centres, velocities, areas = (each[0, present] for each in filters.bodies[0].particles[:3])
+    w = filters.bodies[0].weights[0, present]
     S = np.cov(centres.T, aweights=w, bias=True)
     std = np.sqrt(np.diag(S))
     expected = [*np.average(centres, axis=0, weights=w), *np.average(velocities, axis=0, weights=w), *std,
@@ -135,11 +136,11 @@ def test_presence_without_measurements_is_that_of_the_markov_chain():
     leave, enter = -np.expm1(-0.025 / np.array([1.0, 0.5]))
     expected, found, entries = [1.0], [1.0], []
     for _ in range(60):
-        absent = ~filters.particles.present
+        absent = ~filters.bodies[0].particles.present
         filters.assimilate(*np.zeros((2, 1, 16)), np.zeros((1, 16), dtype=bool))
-        entries.append((absent & filters.particles.present).sum() / max(absent.sum(), 1))
+        entries.append((absent & filters.bodies[0].particles.present).sum() / max(absent.sum(), 1))
         expected.append(expected[-1] * (1.0 - leave) + (1.0 - expected[-1]) * enter)
-        found.append(filters.body()[0, -1])
+        found.append(filters.bodies[0].summary()[0, -1])
     np.testing.assert_allclose(found, expected, atol=0.04)
     assert np.max(entries) > 5.0 * enter
 
@@ -151,9 +152,9 @@ def test_belief_is_the_filter_inside(id):
     for pair in (7, 100, 3):
         core.act(np.array([pair]))
         belief.update({name: array[0] for name, array in core.observe().items()})
-        for ours, inside in zip(belief._filters.filter.particles, core._filters.filter.particles, strict=True):
-            np.testing.assert_array_equal(ours, inside)
-        np.testing.assert_array_equal(belief._filters.filter.weights, core._filters.filter.weights)
+        ours, inside = (each._filters.filter.bodies[0] for each in (belief, core))
+        for mine, theirs in zip((*ours.particles, ours.weights), (*inside.particles, inside.weights), strict=True):
+            np.testing.assert_array_equal(mine, theirs)
 
 
 def test_tracker_is_the_filter_of_an_episode():
@@ -166,10 +167,10 @@ def test_tracker_is_the_filter_of_an_episode():
         assert np.isnan(voltages).sum() == 12
         tracker.assimilate(voltages, currents)
         filters.assimilate(voltages[None], currents[None], world.instrument.measurement_mask(currents)[None])
-    estimate, (index, share) = tracker.estimate(), filters.model.cells(filters.particles)
-    images, areas = filters.model.images.toarray(), filters.particles.areas[0]
-    mean = np.einsum("p,pi,npi->n", filters.weights[0], share[0], images[:, index[0]])
-    square = np.einsum("p,pi,p,npi->n", filters.weights[0], share[0], areas, images[:, index[0]]**2)
+    estimate, (index, share) = tracker.estimate(), filters.model.cells(filters.bodies[0].particles)
+    images, areas = filters.model.images.toarray(), filters.bodies[0].particles.areas[0]
+    mean = np.einsum("p,pi,npi->n", filters.bodies[0].weights[0], share[0], images[:, index[0]])
+    square = np.einsum("p,pi,p,npi->n", filters.bodies[0].weights[0], share[0], areas, images[:, index[0]]**2)
     np.testing.assert_allclose(estimate.mean, 30.0 + mean, rtol=1e-9)
     np.testing.assert_allclose(estimate.variance, square - mean**2, rtol=1e-6, atol=1e-9)
     assert estimate.innovation.shape == (4,) and estimate.innovation_covariance.shape == (4, 4)

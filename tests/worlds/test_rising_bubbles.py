@@ -79,9 +79,9 @@ def test_signals_are_those_of_the_complete_electrode_model(centre, limit):
     disc = disc_indicator(points, np.array(centre), model.radius, TRANSITION_WIDTH)
     expected = np.subtract(*(truth.observation.transfer_resistance(c) for c in (liquid - 28.5 * disc, liquid)))
     filters = BodyParticleFilter(model, 1, 1)
-    filters.particles.centres[:] = centre
-    filters.particles.areas[:] = 1.0
-    index, weights = (each[0, 0] for each in model.cells(filters.particles))
+    filters.bodies[0].particles.centres[:] = centre
+    filters.bodies[0].particles.areas[:] = 1.0
+    index, weights = (each[0, 0] for each in model.cells(filters.bodies[0].particles))
     found = (model.signals[:, index] @ weights).reshape(16, 16)
     scale = (found * expected).sum() / (found**2).sum()
     assert np.linalg.norm(scale * found - expected) < limit * np.linalg.norm(expected)
@@ -92,8 +92,8 @@ def test_particles_move_with_the_flow_and_stay_in_the_pipe():
     """Velocities are relative to the flow; particles leave at the outlet, and absent ones enter at the inlet."""
     filters = BodyParticleFilter(body_model(make_task(BUBBLES)), 2, 4096)
     model, random = filters.model, np.random.default_rng(0)
-    before = filters.particles
-    after, _ = model.move(before, filters.weights, random)
+    before = filters.bodies[0].particles
+    after, _ = model.move(before, filters.bodies[0].weights, random)
     velocity = (after.centres - before.centres) / DT - after.velocities
     inside = (np.abs(before.centres[..., 1]) < 0.03) & (before.centres[..., 0] < 0.35) & after.present
     y = before.centres[..., 1][inside]
@@ -102,9 +102,9 @@ def test_particles_move_with_the_flow_and_stay_in_the_pipe():
     shares = []
     for _ in range(400):
         filters.assimilate(*np.zeros((2, 2, 16)), np.zeros((2, 16), dtype=bool))
-        after = filters.particles
-        shares.append(filters.body()[:, -1].mean())
-        moved = model.move(after, filters.weights, random)[0]
+        after = filters.bodies[0].particles
+        shares.append(filters.bodies[0].summary()[:, -1].mean())
+        moved = model.move(after, filters.bodies[0].weights, random)[0]
         entered = ~after.present & moved.present
         assert (moved.centres[..., 0][entered] < 0.01 + 1.5 * DT).all()
         assert np.abs(moved.centres[..., 1]).max() <= R - 0.01 + 1e-12
@@ -123,5 +123,5 @@ def test_filter_follows_bubbles():
         core.act(np.full(len(seeds), pairs.index(([2, 9], [0, 7], [5, 9])[k % 3])))
         true = [BUBBLES.target.path(BUBBLES, episode_streams(seed).flow) for seed in seeds]
         errors += [np.hypot(*(body[:2] - path.centres[core.t])) for body, path in
-                   zip(core.body(), true, strict=True) if path.present[core.t] and body[-1] > 0.5]
+                   zip(core.bodies()[:, 0], true, strict=True) if path.present[core.t] and body[-1] > 0.5]
     assert len(errors) > 20 and np.median(errors) < 0.012

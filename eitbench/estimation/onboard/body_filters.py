@@ -1,4 +1,4 @@
-"""Particle filters of a body inside injection environments."""
+"""Particle filters of bodies inside injection environments."""
 
 from __future__ import annotations
 
@@ -23,7 +23,8 @@ class BodyFilters(EpisodeFilters):
         return [0] * len(frames)
 
     def _start(self, episodes: int) -> None:
-        self.filter = BodyParticleFilter(body_model(self.table.task), episodes, self.n_particles)
+        model = body_model(self.table.task)
+        self.filter = BodyParticleFilter(model, episodes, self.n_particles)
         self.patches = body_patches(self._rules.world.fault_free)
 
     def _condition(self, voltages: np.ndarray,
@@ -43,16 +44,17 @@ class BodyFilters(EpisodeFilters):
         return [Innovation.of(*each) for each in zip(*self.filter.innovation, strict=True)]
 
     def coarse_grid(self) -> tuple[np.ndarray, np.ndarray]:
-        return self.c_ref[:, None] + self.filter.mean(self.patches), self.filter.std(self.patches)
+        variance = self.filter.variance(self.patches)
+        return self.c_ref[:, None] + self.filter.mean(self.patches), np.sqrt(variance)
 
     def means(self) -> np.ndarray:
         return self.c_ref[:, None] + self.filter.mean(self.filter.model.images)
 
     def stds(self) -> np.ndarray:
-        return self.filter.std(self.filter.model.images)
+        return np.sqrt(self.filter.variance(self.filter.model.images))
 
-    def body(self) -> np.ndarray:
-        return self.filter.body()
+    def bodies(self) -> np.ndarray:
+        return self.filter.summaries()
 
 
 class FullBodyFilters(BodyFilters):

@@ -103,7 +103,7 @@ class EpisodeFilters:
     def features(self) -> dict[str, np.ndarray]:
         """Return innovations (B, L) in predicted standard deviations, mean and std (B, patches) in
         mol/m³, the fault scores doubt (B, 2, L), and, if estimated, velocity and its std in m/s, or
-        `BODY`."""
+        `BODY` of each body (B, 9 bodies)."""
         mean, std = self.coarse_grid()
         doubt = self._doubt
         if self.faults is not None:
@@ -112,8 +112,8 @@ class EpisodeFilters:
                  "doubt": doubt.copy()}
         if (flow := self.velocity()) is not None:
             shown |= {"velocity": flow[0], "velocity_std": flow[1]}
-        if (body := self.body()) is not None:
-            shown["body"] = body
+        if (bodies := self.bodies()) is not None:
+            shown["body"] = bodies.reshape(len(mean), -1)
         return shown
 
     def innovations(self) -> list[Innovation | None]:
@@ -146,8 +146,9 @@ class EpisodeFilters:
         task specifies the velocity."""
         return None
 
-    def body(self) -> np.ndarray | None:
-        """Return the estimated `BODY` of each episode, (B, 9); None without a body."""
+    def bodies(self) -> np.ndarray | None:
+        """Return the estimated `BODY` of each body in each episode, (B, bodies, 9); None without.
+        """
         return None
 
     @staticmethod

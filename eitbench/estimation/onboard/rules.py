@@ -82,7 +82,7 @@ class Rules:
 
     @property
     def tracks_body(self) -> bool:
-        """True if the filter inside estimates the position of a body, not a concentration."""
+        """True if the filter inside estimates positions of bodies, not a concentration."""
         return isinstance(self.world.target, MovingBody)
 
     @property
