@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 from eitbench.worlds import entries, entry, registry
+from eitbench.worlds.bodies import MovingBody
 
 PLAIN = [name for name, each in entries().items() if each.world == entry("eitbench/Pipe2D-v0").world]
 """Ids with the thesis' pipe as it is."""
@@ -48,6 +49,7 @@ SHORT = {
     "WanderingBody2D": TANK,
     "SearchAndTrack": {"schedule": {"scored_steps": 4}},
     "BubbleTracking": {"schedule": {"scored_steps": 4}},
+    "TwoBubbleTracking": {"schedule": {"scored_steps": 4}},
     "RisingBubbles2D": {"schedule": {"warm_up": 1, "scored_steps": 4}},
     "TankInjection": {"schedule": {"warm_up": 2, "scored_steps": 3}},
 }
@@ -59,7 +61,7 @@ def world(name: str) -> dict:
     """Return keyword arguments for short episodes of an id."""
     each = entry(name)
     kind = each.world.name
-    if each.track == "injection" and kind not in ("TankTracking", "SearchAndTrack", "BubbleTracking"):
+    if each.track == "injection" and not isinstance(each.world.target, MovingBody):
         kind = "TankInjection" if kind == "RotatingTank2D" else "PipeInjection"
     assert kind in SHORT, f"{name} has no short version yet: give {kind!r} one in tests/short.py"
     return {"world": SHORT[kind]}

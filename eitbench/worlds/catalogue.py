@@ -216,3 +216,5 @@ pairs), of a bubble at the wall by up to 2.2 (``tests/worlds/test_wandering_body
 add_extension(replace(BUBBLE_TRACKING, name="RisingBubbles2D",
                       instrument=replace(BUBBLE_TRACKING.instrument, readings="all")))
 add_injection(BUBBLE_TRACKING, test_seeds="test:0-49")
+add_injection(replace(BUBBLE_TRACKING, name="TwoBubbleTracking", target=RisingBubble(n_bodies=2)),
+              test_seeds="test:0-49")
