@@ -346,7 +346,7 @@ class BodyParticleFilter:
         others = len(alone) - 1
         used = injection.used
         without = np.where(used, noise, 1.0)[..., None] * np.eye(used.shape[1])
-        innovation = sum(mean for _, mean, _ in alone) - others * used * residual
+        innovation = sum(mean for _, mean, _ in alone) - others * np.where(used, residual, 0.0)
         S = sum(S for *_, S in alone) - others * without
         if not others:
             return [self.bodies[0].posterior(alone[0][0])], innovation, S

@@ -22,6 +22,7 @@ from eitbench.report.policies import (
     gap_text,
     policy_rows,
 )
+from eitbench.worlds import entry
 from eitbench.worlds.catalogue import PIPE_2D
 from scipy.stats import t as student
 
@@ -142,6 +143,25 @@ def test_an_even_budget_is_spent_exactly(budget):
     when = np.flatnonzero([rules.is_injection_step(np.array([left, 0.0])) for left in range(steps, 0, -1)])
     assert len(when) == min(budget, steps)
     assert len(when) < 2 or np.ptp(np.diff([-1, *when])) <= 1
+
+
+def test_slug_triggered_follows_a_slug_and_rests_after_it():
+    """The remaining injections are evenly spaced, then every third step while the last one shows a slug at the inlet:
+    at first a weak one, which has left three steps later, then a strong one. After each, ten steps have none."""
+    rules = Rules(entry("eitbench/Pipe2DInjectionInflowBudget-v0").world, inflow="learned")
+    policy = load_method("slug_triggered", "injection").make(rules, np.random.default_rng(0))
+    idle, left, injected = rules.action(None), 30, []
+    currents = np.zeros(16)
+    for k in range(180):
+        mean = np.full(36, 400.0)
+        mean[12] *= 1.06 + 0.04 * (k > 26) if 12 <= k < 40 else 1.04           # row 1, column 0
+        action = policy.act({"currents": currents, "mean": mean, "left": np.array([180.0 - k, left])})
+        assert action == idle or rules.pairs[action].tolist() == [0, 9]
+        currents = rules.currents(np.array([action]))[0]
+        left -= action != idle
+        injected += [k] * (action != idle)
+    assert injected[:11] == [5, 11, 14, 25, 28, 31, 34, 37, 40, 51, 58]
+    assert len(injected) == 30 and injected[-1] == 174
 
 
 # -- rollouts ---------------------------------------------------------------------------------------------------------

@@ -8,10 +8,10 @@ from eitbench.data.episode_cache import cached_episode, cycle_voltages
 from eitbench.estimation.onboard.linearisation import electrode_pairs
 from eitbench.estimation.onboard.reduced_filters import ReducedFilters
 
-from injection_envs import CURRENTS, FAULTS, FLOW, INFLOW, NAME, TANK, arrays_of, filter_of, make, some_pairs
+from injection_envs import BUDGET, CURRENTS, FAULTS, FLOW, INFLOW, NAME, TANK, arrays_of, filter_of, make, some_pairs
 from short import world
 
-VECTORISED = (FAULTS, FLOW, INFLOW, TANK, "eitbench/SearchAndTrack-v0")
+VECTORISED = (FAULTS, FLOW, INFLOW, TANK, "eitbench/SearchAndTrack-v0", "eitbench/TwoBubbleTracking-v0")
 """One id of each kind of filter."""
 
 
@@ -91,6 +91,29 @@ def test_reward_is_the_decrease_of_the_error(estimator, name):
         assert reward == pytest.approx(homogeneous - error, rel=1e-5)
         paid += 1
     assert paid == played.schedule.scored_steps
+
+
+@pytest.mark.parametrize("history", ["steps", "injections"])
+def test_observations_keep_the_last_steps_or_injections(history):
+    """Steps without an injection shift the currents of the last steps, but not those of the last injections."""
+    env = make("reduced", BUDGET, history=history, inflow="learned")
+    first = env.reset(seed=2)[0]
+    idle, steps = env.unwrapped.rules.action(None), []
+    for action in (30, idle, idle, 70, idle):
+        steps.append(env.step(action)[0])
+    currents = [each["currents"] for each in steps]
+    shown = steps[-1]
+    if history == "steps":
+        assert "waited" not in shown and not shown["innovations"].any()
+        np.testing.assert_array_equal(shown["recent"], currents[:0:-1])
+    else:
+        assert [int(each["waited"][0]) for each in (first, *steps)] == [0, 0, 1, 2, 0, 1]
+        np.testing.assert_array_equal(shown["recent"], [currents[3], currents[0], *first["recent"][:2]])
+        np.testing.assert_array_equal(shown["innovations"], steps[3]["innovations"])
+        np.testing.assert_array_equal(steps[2]["innovations"], steps[0]["innovations"])
+        assert (steps[3]["innovations"] != steps[2]["innovations"]).any()
+        scaled = make("reduced", BUDGET, observation="scaled", history=history, inflow="learned")
+        assert len(scaled.reset(seed=2)[0]) == 203
 
 
 @pytest.mark.parametrize(("name", "estimator", "observation"), [

@@ -90,25 +90,32 @@ def test_weights_are_those_of_bayes_formula():
     assert np.isnan(np.delete(core._voltages[0], measured)).all()
 
 
-def test_criteria_are_those_of_a_gaussian_of_images_and_voltages():
-    """A-criterion: the decrease of the image's variances by conditioning; D-criterion: half log det of S R⁻¹."""
-    _, belief = believed()
+@pytest.mark.parametrize("id", ["eitbench/TankTracking-v0", "eitbench/TwoBubbleTracking-v0"])
+def test_criteria_are_those_of_a_gaussian_of_images_and_voltages(id):
+    """A-criterion: the decrease of the image's variances by conditioning; D-criterion: half log det of S R⁻¹. Moments
+    of several bodies add up."""
+    _, belief = believed(id)
     filters, rules = belief._filters.filter, belief.rules
-    model = filters.model
+    model, random = filters.model, np.random.default_rng(1)
     gains, information = belief.criteria()
-    particles, (w,) = model.move(filters.bodies[0].particles, filters.bodies[0].weights, np.random.default_rng(1))
-    index, share = (each[0] for each in model.cells(particles))
-    images = np.array([belief._filters.patches[:, index[p]] @ share[p] for p in range(len(w))])
-    changes = np.array([model.signals[:, index[p]] @ share[p] for p in range(len(w))]).reshape(-1, 16, 16)
+    bodies = []
+    for body in filters.bodies:
+        particles, (w,) = model.move(body.particles, body.weights, random)
+        index, share = (each[0] for each in model.cells(particles))
+        images = np.array([belief._filters.patches[:, index[p]] @ share[p] for p in range(len(w))])
+        changes = np.array([model.signals[:, index[p]] @ share[p] for p in range(len(w))]).reshape(-1, 16, 16)
+        bodies.append((w, images, changes))
     for pair in (0, 7, 57, 119):
         i, j = rules.pairs[pair]
         current = np.zeros(16)
         current[[i, j]] = rules.amplitude, -rules.amplitude
         measured = rules.instrument.measurement_mask(current)
-        voltages = (changes @ current)[:, measured]
         std = model.noise_std(model.resistance @ current)[measured]
-        R = np.diag(std**2 + model.motion.signal_error**2 * (w @ voltages**2))
-        joint = np.cov(np.hstack([images, voltages]).T, aweights=w, bias=True)
+        R, joint = np.diag(std**2), 0.0
+        for w, images, changes in bodies:
+            voltages = (changes @ current)[:, measured]
+            R = R + np.diag(model.motion.signal_error**2 * (w @ voltages**2))
+            joint = joint + np.cov(np.hstack([images, voltages]).T, aweights=w, bias=True)
         m = images.shape[1]
         S = joint[m:, m:] + R
         assert gains[pair] == pytest.approx(np.trace(joint[:m, m:] @ np.linalg.solve(S, joint[m:, :m])), rel=1e-6)
