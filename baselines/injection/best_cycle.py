@@ -22,7 +22,8 @@ class Policy(CyclePolicy):
                   "Pipe2DIntermittent with a budget and a fitted inflow prior": [[0, 9]],
                   "Pipe2DDriftingVelocity": [[7, 8], [1, 7]], "RotatingTank2D": [[9, 15]],
                   "TankTracking": ROTATION, "SearchAndTrack": [[4, 13], [3, 14], [0, 10]],
-                  "BubbleTracking": [[2, 10], [4, 12], [2, 10]]},
+                  "BubbleTracking": [[2, 10], [4, 12], [2, 10]],
+                  "TwoBubbleTracking": [[3, 9], [1, 10]]},
         "environment_steps": {
             "Pipe2D": 346_368, "Pipe2D with faults": 608_768,
             "Pipe2D with estimated faults": 467_072,
@@ -30,7 +31,7 @@ class Policy(CyclePolicy):
             "Pipe2DIntermittent with a budget and a fitted inflow prior": 768_768,
             "Pipe2DDriftingVelocity": 217_792,
             "RotatingTank2D": 333_696, "TankTracking": 712_704, "SearchAndTrack": 712_704,
-            "BubbleTracking": 1_127_424}}
+            "BubbleTracking": 1_127_424, "TwoBubbleTracking": 476_160}}
 
     @classmethod
     def suits(cls, rules: Rules) -> bool:
