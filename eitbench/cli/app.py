@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -21,6 +22,8 @@ Quick start:  eitbench run  — runs the built-in estimators on four test episod
 table, writes results/index.html.
 """)
 
+command = partial(app.command, cls=options.SingleValueCommand)
+
 
 def _print_version(asked: bool) -> None:
     if asked:
@@ -36,7 +39,7 @@ def _main(
     pass
 
 
-@app.command("list")
+@command("list")
 def list_() -> None:
     """List environments, built-in estimators and policies, with their subtracks."""
     from eitbench.bench.methods import builtin_methods, builtin_summary
@@ -71,10 +74,10 @@ def list_() -> None:
         options.echo(f"{name:42} {boards:30}  {about}".rstrip())
 
 
-app.command()(run)
+command()(run)
 
 
-@app.command()
+@command()
 def submit(
     env: options.Environments = None,
     baseline: Annotated[str | None, typer.Option(
@@ -113,10 +116,10 @@ def submit(
                              f"{worse}; the method may have diverged", err=True)
 
 
-app.command()(verify)
+command()(verify)
 
 
-@app.command()
+@command()
 def golden(
     names: Annotated[list[str] | None, typer.Argument(
         help="Environment ids or built-in methods. Default: all.")] = None,
@@ -145,10 +148,10 @@ def golden(
 
 app.add_typer(learn.fit, name="fit")
 for _command in (learn.bank, learn.train, learn.export, estimate, fetch):
-    app.command()(_command)
+    command()(_command)
 
 
-@app.command()
+@command()
 def leaderboard(
     out: options.Out = Path("results"),
     records: Annotated[Path | None, typer.Option(
@@ -186,7 +189,7 @@ def leaderboard(
     raise typer.Exit(bool(complaints))
 
 
-@app.command()
+@command()
 def compare(
     a: Annotated[str, typer.Argument(
         help="File of a record, or METHOD or METHOD@VERSION among the records; the name of an "
@@ -208,7 +211,7 @@ def compare(
     options.echo(comparison.format_comparison(table, ours[0], theirs[0], score, width))
 
 
-@app.command()
+@command()
 def render(
     env: options.EnvironmentId = "eitbench/Pipe2D-v0",
     baseline: Annotated[list[str] | None, typer.Option(

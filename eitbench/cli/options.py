@@ -6,14 +6,16 @@ import importlib
 import os
 import shutil
 import sys
+from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import cloudpickle
 import typer
+from typer.core import TyperCommand
 
 from eitbench._extras import missing_extra
 from eitbench._files import resolve_input
@@ -23,6 +25,17 @@ from eitbench.data.parallel import WorkerLostError
 CORES = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 Backend = StrEnum("Backend", ["loky", "ray", "dask"])
 Isolation = StrEnum("Isolation", ["auto", "none", "process", "bubblewrap"])
+
+
+class SingleValueCommand(TyperCommand):
+    """A command that refuses a second value of an option with one: the last would replace it."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        *_, order = self.make_parser(ctx).parse_args(args=list(args))
+        for option, count in Counter(order).items():
+            if count > 1 and option.param_type_name == "option" and not option.multiple:
+                ctx.fail(f"{option.opts[0]} may be given once, got {count} times")
+        return super().parse_args(ctx, args)
 
 
 def resolve_path(path: Path | None) -> Path | None:

@@ -1,4 +1,5 @@
-"""Axial flows in a plane channel: a skewed profile, and parametrised profiles for estimation."""
+"""Axial flows in channels and round pipes: skewed and blunt profiles, and parametrised profiles for
+estimation."""
 
 from __future__ import annotations
 
@@ -10,7 +11,7 @@ import numpy as np
 from numpy.polynomial.polynomial import polyval
 
 from eitbench import _check
-from eitbench.physics.flow import AxialFlow, ChannelFlow
+from eitbench.physics.flow import AxialFlow, ChannelFlow, check_flow
 
 _ETA, _WEIGHTS = np.polynomial.legendre.leggauss(24)
 """Gauss–Legendre points and weights on [−1, 1]: exact to rounding for products of profiles."""
@@ -48,20 +49,70 @@ class PolynomialFlow(AxialFlow):
         return polyval(y / self.half_width, self.coefficients)
 
 
+class RadialFlow:
+    """A velocity along z that depends on the distance from the z axis only."""
+
+    def profile(self, r: np.ndarray) -> np.ndarray:
+        """Axial velocity in m/s at distances ``r`` in m."""
+        raise NotImplementedError
+
+    def __call__(self, points: np.ndarray) -> np.ndarray:
+        velocity = np.zeros_like(points, dtype=float)
+        velocity[:, 2] = self.profile(np.hypot(*points[:, :2].T))
+        return velocity
+
+
+@dataclass(frozen=True)
+class BluntPipeFlow(RadialFlow):
+    """v = v̄·(m + 2)/m·(1 − (r/R)ᵐ) along z in a round pipe; m = 2: laminar, m → ∞: plug flow."""
+
+    mean_velocity: float
+    """v̄ in m/s, ≥ 0"""
+    radius: float
+    """R in m, > 0"""
+    exponent: float = 2.0
+    """m, ≥ 1"""
+
+    def __post_init__(self) -> None:
+        check_flow(self.mean_velocity, radius=self.radius)
+        _check.number("exponent", self.exponent, low=1.0)
+
+    def profile(self, r: np.ndarray) -> np.ndarray:
+        m = self.exponent
+        relative = np.minimum(r / self.radius, 1.0)              # by rounding r may exceed R
+        return self.mean_velocity * (m + 2.0) / m * (1.0 - relative**m)
+
+
+@dataclass(frozen=True)
+class RadialPolynomialFlow(RadialFlow):
+    """v = Σ a_j (r/R)ʲ along z in a round pipe."""
+
+    coefficients: tuple[float, ...]
+    """a_j in m/s"""
+    radius: float
+    """R in m"""
+
+    def profile(self, r: np.ndarray) -> np.ndarray:
+        return polyval(np.minimum(r / self.radius, 1.0), self.coefficients)
+
+
 @dataclass(frozen=True)
 class VelocityModel:
-    """Parametrisation v = Σ θ_k φ_k(y/R) along x of a flow; θ is a random walk (thesis ch. 6)."""
+    """Parametrisation v = Σ θ_k φ_k(y/R) along x of a flow, or v = Σ θ_k φ_k(r/R) along z in a
+    round pipe; θ is a random walk (thesis ch. 6)."""
 
     half_width: float
     """R in m"""
     basis: tuple[tuple[float, ...], ...]
-    """φ_k as polynomials in y/R: coefficients of 1, y/R, (y/R)², …; no unit"""
+    """φ_k as polynomials in y/R or r/R: coefficients of 1, y/R, (y/R)², …; no unit"""
     nominal: tuple[float, ...]
     """(k,) prior mean of θ in m/s"""
     initial_std: tuple[float, ...]
     """(k,) prior standard deviation of θ in m/s"""
     walk_std: tuple[float, ...]
     """(k,) standard deviation in m/s of the random walk per time step"""
+    is_round: bool = False
+    """True in a round pipe"""
 
     def __post_init__(self) -> None:
         _check.number("half_width", self.half_width, low=0.0, open_low=True, units="m")
@@ -80,35 +131,46 @@ class VelocityModel:
 
     @property
     def points(self) -> np.ndarray:
-        """(p,) heights in m of the quadrature points."""
-        return self.half_width * _ETA
+        """(p,) heights y, or distances r, in m of the quadrature points."""
+        return self.half_width * self._places
 
     @property
     def weights(self) -> np.ndarray:
-        """(p,) quadrature weights in m of `points`."""
+        """(p,) quadrature weights of `points`, in m, or of areas in m² in a round pipe."""
+        if self.is_round:
+            return np.pi * self.half_width**2 * self._places * _WEIGHTS
         return self.half_width * _WEIGHTS
+
+    @property
+    def _places(self) -> np.ndarray:
+        return 0.5 * (_ETA + 1.0) if self.is_round else _ETA
 
     @property
     def profiles(self) -> np.ndarray:
         """(p, k) φ_k at `points`."""
-        return np.stack([polyval(_ETA, shape) for shape in self.basis], axis=1)
+        return np.stack([polyval(self._places, shape) for shape in self.basis], axis=1)
 
     @cached_property
     def gram(self) -> np.ndarray:
-        """(k, k) ∫φ_k φ_l across the pipe in m."""
+        """(k, k) ∫φ_k φ_l across the pipe in m, or in m²."""
         return self.profiles.T @ (self.weights[:, None] * self.profiles)
 
     @property
-    def basis_fields(self) -> list[PolynomialFlow]:
+    def basis_fields(self) -> list[PolynomialFlow | RadialPolynomialFlow]:
         """Velocity fields dv/dθ_k."""
-        return [PolynomialFlow(shape, self.half_width) for shape in self.basis]
+        return [self._flow(shape) for shape in self.basis]
 
-    def field(self, parameters: np.ndarray | Sequence[float]) -> PolynomialFlow:
+    def _flow(self, coefficients: tuple[float, ...]) -> PolynomialFlow | RadialPolynomialFlow:
+        kind = RadialPolynomialFlow if self.is_round else PolynomialFlow
+        return kind(coefficients, self.half_width)
+
+    def field(self, parameters: np.ndarray | Sequence[float],
+              ) -> PolynomialFlow | RadialPolynomialFlow:
         """Return the velocity field of ``parameters`` (k,) in m/s."""
         theta = _check.array("parameters", parameters, (self.n_parameters,), units="m/s")
         degree = max(map(len, self.basis))
         shapes = np.array([np.pad(shape, (0, degree - len(shape))) for shape in self.basis])
-        return PolynomialFlow(tuple((theta @ shapes).tolist()), self.half_width)
+        return self._flow(tuple((theta @ shapes).tolist()))
 
 
 def parabolic_model(half_width: float, mean_velocity: float, initial_std: float,

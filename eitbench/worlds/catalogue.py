@@ -15,6 +15,7 @@ from eitbench.worlds.flows import (
     FlowPastBulge,
     LaminarFlow,
     NoFlow,
+    RandomBluntFlow,
     RandomFlow,
     RandomWalkFlow,
     StirredFlow,
@@ -128,6 +129,10 @@ PIPE_3D = add_example(
 """The available excerpt of thesis 5.2 has the figure only; times, velocity and noise are taken from
 the 2D pipe of the thesis. Three frames are scored [E]."""
 add_example(PIPE_3D, "Pipe3DSmoothing", test_seeds="test:0-5", lag="all")
+add_extension(replace(PIPE_3D, name="Pipe3DUnknownVelocity", flow=RandomBluntFlow()),
+              test_seeds="test:0-5")
+"""The prior of the mean velocity is 4.5 ± 1 m/s; the true profile is between laminar and plug flow,
+and no combination of the two profiles of the task equals it [E]."""
 
 # -- Stirred tank and stationary tank (7.1, 7.2) --
 

@@ -12,10 +12,15 @@ import numpy as np
 
 from eitbench import _check
 from eitbench.physics.flow import PowerLawFlow
-from eitbench.physics.profiles import SkewedChannelFlow, VelocityModel, parabolic_model
+from eitbench.physics.profiles import (
+    BluntPipeFlow,
+    SkewedChannelFlow,
+    VelocityModel,
+    parabolic_model,
+)
 from eitbench.worlds.fields import check_not_negative, check_positive, check_ranges
 from eitbench.worlds.task import make_task
-from eitbench.worlds.vessels import PlanePipe
+from eitbench.worlds.vessels import PlanePipe, RoundPipe
 from eitbench.worlds.world import Discretisation, Flow, World, reject_unknown_assumptions
 
 if TYPE_CHECKING:
@@ -128,6 +133,49 @@ class RandomFlow(PipeFlow):
             return SkewedChannelFlow(velocity, world.vessel.half_width, skewness)
 
         return flow
+
+
+@dataclass(frozen=True)
+class RandomBluntFlow(PipeFlow):
+    """Steady flow through a round pipe that is drawn for each episode, between laminar and plug
+    flow: v = v̄·(m + 2)/m·(1 − (r/R)ᵐ). The task specifies a laminar flow; all numbers [E]."""
+
+    velocity_range: tuple[float, float] = (3.0, 6.5)
+    """m/s, true v̄, uniform"""
+    plug_range: tuple[float, float] = (0.0, 0.8)
+    """1 − 2/m, uniform: 0 is laminar, 1 plug flow"""
+    velocity_std: float = 1.0
+    """m/s, standard deviation of the prior of v̄ and of the second parameter"""
+    velocity_walk: float = 0.02
+    """m/s per time step, standard deviation of the assumed random walk"""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_ranges(self, velocity_range="m/s")
+        check_ranges(self, plug_range="", open_low=False)
+        check_not_negative(self, velocity_std="m/s", velocity_walk="m/s")
+        if self.plug_range[1] >= 1.0:
+            raise ValueError(f"plug_range must lie below 1, got {self.plug_range!r}")
+
+    def check(self, world: World) -> None:
+        """Raise ``ValueError`` unless the vessel is a round pipe."""
+        if not isinstance(world.vessel, RoundPipe):
+            raise ValueError(f"vessel must be a RoundPipe, got {world.vessel!r}")
+
+    def spin_up_steps(self, world: World) -> int:
+        return transit_steps(world, self.velocity_range[0])
+
+    def velocity_model(self, world: World) -> VelocityModel:
+        # a parabola, and a quartic without net flux that flattens or sharpens it
+        basis = ((2.0, 0.0, -2.0), (-1.0, 0.0, 4.0, 0.0, -3.0))
+        return VelocityModel(world.vessel.radius, basis, (self.mean_velocity, 0.0),
+                             (self.velocity_std,) * 2, (self.velocity_walk,) * 2, is_round=True)
+
+    def draw(self, world: World, random: np.random.Generator) -> Callable[[int], BluntPipeFlow]:
+        mean = random.uniform(*self.velocity_range)
+        exponent = 2.0 / (1.0 - random.uniform(*self.plug_range))
+        flow = BluntPipeFlow(mean, world.vessel.radius, exponent)
+        return lambda t: flow
 
 
 @dataclass(frozen=True)
