@@ -25,6 +25,8 @@ FAST = {"flow": {"mean_velocity": 45.0}, "schedule": {"scored_steps": 3, "patter
 DRAWN = merged(FAST, {"flow": {"velocity_range": [40.0, 50.0]}})
 WANDERING = merged(DRAWN, {"region": [0.28, 0.40], "schedule": {"scored_steps": 5}})
 TANK = {"vessel": {"n_electrodes": 8}, "schedule": {"warm_up": 1, "scored_steps": 4}}
+ROUND = {"flow": {"mean_velocity": 45.0}, "schedule": {"scored_steps": 3, "pattern": {"frame": 2}},
+         "vessel": {"potential_order": 1, "electrode_rings": 1, "electrodes_per_ring": 4}}
 
 SHORT = {
     "Pipe2D": FAST,
@@ -40,8 +42,8 @@ SHORT = {
     "Pipe2DOtherVelocity": DRAWN,
     "Pipe2DOtherContacts": FAST,
     "Pipe2DOtherInlet": FAST,
-    "Pipe3D": {"flow": {"mean_velocity": 45.0}, "schedule": {"scored_steps": 3, "pattern": {"frame": 2}},
-               "vessel": {"potential_order": 1, "electrode_rings": 1, "electrodes_per_ring": 4}},
+    "Pipe3D": ROUND,
+    "Pipe3DUnknownVelocity": merged(ROUND, {"flow": {"velocity_range": [30.0, 65.0]}}),
     "RotatingTank2D": TANK,
     "StationaryTank2D": {"vessel": {"n_electrodes": 8}, "schedule": {"scored_steps": 5}},
     "PipeInjection": {"schedule": {"scored_steps": 4}},
