@@ -65,24 +65,39 @@ class PowerLawFlow(ChannelFlow):
         return (1.0 + self.exponent) * self.mean_velocity * from_wall**self.exponent
 
 
+class RadialFlow:
+    """A velocity along z that depends on the distance r from the z axis only."""
+
+    def profile(self, r: np.ndarray) -> np.ndarray:
+        """Axial velocity in m/s at distances ``r`` in m."""
+        raise NotImplementedError
+
+    def __call__(self, points: np.ndarray) -> np.ndarray:
+        velocity = np.zeros_like(points, dtype=float)
+        velocity[:, 2] = self.profile(np.hypot(*points[:, :2].T))
+        return velocity
+
+
 @dataclass(frozen=True)
-class RoundPipeFlow:
-    """Hagen–Poiseuille flow in a round pipe: v(r) = 2·v̄·(1 − (r/R)²) along z, r² = x² + y²."""
+class RoundPipeFlow(RadialFlow):
+    """Flow in a round pipe: v(r) = v̄·(m + 2)/m·(1 − (r/R)ᵐ) along z, by default laminar
+    (Hagen–Poiseuille); m → ∞ is plug flow."""
 
     mean_velocity: float
     """v̄ in m/s, ≥ 0"""
     radius: float
     """R in m, > 0"""
+    exponent: float = 2.0
+    """m, ≥ 1"""
 
     def __post_init__(self) -> None:
         check_flow(self.mean_velocity, radius=self.radius)
+        _check.number("exponent", self.exponent, low=1.0)
 
-    def __call__(self, points: np.ndarray) -> np.ndarray:
-        velocity = np.zeros_like(points, dtype=float)
-        squared = (points[:, :2]**2).sum(axis=1) / self.radius**2
-        # by rounding r may exceed R
-        velocity[:, 2] = 2.0 * self.mean_velocity * np.maximum(1.0 - squared, 0.0)
-        return velocity
+    def profile(self, r: np.ndarray) -> np.ndarray:
+        m = self.exponent
+        relative = np.minimum(r / self.radius, 1.0)              # by rounding r may exceed R
+        return self.mean_velocity * (m + 2.0) / m * (1.0 - relative**m)
 
 
 def check_flow(mean_velocity: float, **size: float) -> None:

@@ -1,5 +1,4 @@
-"""Axial flows in channels and round pipes: skewed and blunt profiles, and parametrised profiles for
-estimation."""
+"""Axial flows: a skewed profile in a plane channel, and parametrised profiles for estimation."""
 
 from __future__ import annotations
 
@@ -11,7 +10,7 @@ import numpy as np
 from numpy.polynomial.polynomial import polyval
 
 from eitbench import _check
-from eitbench.physics.flow import AxialFlow, ChannelFlow, check_flow
+from eitbench.physics.flow import AxialFlow, ChannelFlow, RadialFlow
 
 _ETA, _WEIGHTS = np.polynomial.legendre.leggauss(24)
 """Gauss–Legendre points and weights on [−1, 1]: exact to rounding for products of profiles."""
@@ -47,40 +46,6 @@ class PolynomialFlow(AxialFlow):
 
     def profile(self, y: np.ndarray) -> np.ndarray:
         return polyval(y / self.half_width, self.coefficients)
-
-
-class RadialFlow:
-    """A velocity along z that depends on the distance from the z axis only."""
-
-    def profile(self, r: np.ndarray) -> np.ndarray:
-        """Axial velocity in m/s at distances ``r`` in m."""
-        raise NotImplementedError
-
-    def __call__(self, points: np.ndarray) -> np.ndarray:
-        velocity = np.zeros_like(points, dtype=float)
-        velocity[:, 2] = self.profile(np.hypot(*points[:, :2].T))
-        return velocity
-
-
-@dataclass(frozen=True)
-class BluntPipeFlow(RadialFlow):
-    """v = v̄·(m + 2)/m·(1 − (r/R)ᵐ) along z in a round pipe; m = 2: laminar, m → ∞: plug flow."""
-
-    mean_velocity: float
-    """v̄ in m/s, ≥ 0"""
-    radius: float
-    """R in m, > 0"""
-    exponent: float = 2.0
-    """m, ≥ 1"""
-
-    def __post_init__(self) -> None:
-        check_flow(self.mean_velocity, radius=self.radius)
-        _check.number("exponent", self.exponent, low=1.0)
-
-    def profile(self, r: np.ndarray) -> np.ndarray:
-        m = self.exponent
-        relative = np.minimum(r / self.radius, 1.0)              # by rounding r may exceed R
-        return self.mean_velocity * (m + 2.0) / m * (1.0 - relative**m)
 
 
 @dataclass(frozen=True)

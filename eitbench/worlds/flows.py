@@ -11,13 +11,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from eitbench import _check
-from eitbench.physics.flow import PowerLawFlow
-from eitbench.physics.profiles import (
-    BluntPipeFlow,
-    SkewedChannelFlow,
-    VelocityModel,
-    parabolic_model,
-)
+from eitbench.physics.flow import PowerLawFlow, RoundPipeFlow
+from eitbench.physics.profiles import SkewedChannelFlow, VelocityModel, parabolic_model
 from eitbench.worlds.fields import check_not_negative, check_positive, check_ranges
 from eitbench.worlds.task import make_task
 from eitbench.worlds.vessels import PlanePipe, RoundPipe
@@ -171,10 +166,10 @@ class RandomBluntFlow(PipeFlow):
         return VelocityModel(world.vessel.radius, basis, (self.mean_velocity, 0.0),
                              (self.velocity_std,) * 2, (self.velocity_walk,) * 2, is_round=True)
 
-    def draw(self, world: World, random: np.random.Generator) -> Callable[[int], BluntPipeFlow]:
+    def draw(self, world: World, random: np.random.Generator) -> Callable[[int], RoundPipeFlow]:
         mean = random.uniform(*self.velocity_range)
         exponent = 2.0 / (1.0 - random.uniform(*self.plug_range))
-        flow = BluntPipeFlow(mean, world.vessel.radius, exponent)
+        flow = RoundPipeFlow(mean, world.vessel.radius, exponent)
         return lambda t: flow
 
 

@@ -20,7 +20,8 @@ from eitbench.worlds.stored_names import add_current_members
 if TYPE_CHECKING:
     from eitbench.numerics.mesh import Mesh
     from eitbench.physics.cem import CompleteElectrodeModel
-    from eitbench.physics.profiles import BluntPipeFlow, SkewedChannelFlow, VelocityModel
+    from eitbench.physics.flow import RoundPipeFlow
+    from eitbench.physics.profiles import SkewedChannelFlow, VelocityModel
     from eitbench.physics.transport import Transport, VelocityField
 
 
@@ -94,7 +95,7 @@ class Flow(Protocol):
         return None
 
     def draw(self, world: World, random: np.random.Generator,
-             ) -> Callable[[int], SkewedChannelFlow | BluntPipeFlow] | None:
+             ) -> Callable[[int], SkewedChannelFlow | RoundPipeFlow] | None:
         """Draw t -> the flow from t − 1 to t of an episode; None: all have the nominal flow."""
         return None
 
