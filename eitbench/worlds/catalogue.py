@@ -181,10 +181,10 @@ PIPE_2D_INTERMITTENT = add_extension(
 
 PIPE_2D_BUDGET = add_injection(
     replace(PIPE_2D_INTERMITTENT, schedule=Schedule(scored_steps=180, budget=30)),
-    "Pipe2DInjectionInflowBudget", test_seeds="test:0-49", inflow="learned", history="injections")
+    "Pipe2DInjectionInflowBudget", test_seeds="test:0-49", inflow="learned", history="injections",
+    is_starting_point=True)
 """The same episodes; the agent has a budget of 30 injections, one sixth of the scored steps."""
-add_injection(PIPE_2D_BUDGET, "Pipe2DInjectionBudget", test_seeds="test:0-49",
-              is_starting_point=True)
+add_injection(PIPE_2D_BUDGET, "Pipe2DInjectionBudget", test_seeds="test:0-49")
 
 PIPE_2D_DRIFTING = add_injection(
     World("Pipe2DDriftingVelocity", PlanePipe(), RandomWalkFlow(), Slugs(), region=(0.28, 0.40)),

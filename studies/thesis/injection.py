@@ -23,7 +23,7 @@ from eitbench.report.policies import OPEN_LOOP, errors_by_policy, gap_text, poli
 from .common import ACCENT, GREY, INK, despine, save_figure
 
 WORLDS = {"eitbench/Pipe2DInjectionFaults-v0": "faulty electrodes",
-          "eitbench/Pipe2DInjectionBudget-v0": "a budget",
+          "eitbench/Pipe2DInjectionInflowBudget-v0": "a budget",
           "eitbench/Pipe2DInjectionFlow-v0": "unknown flow",
           "eitbench/TankTracking-v0": "a moving body",
           "eitbench/SearchAndTrack-v0": "a body that comes and goes",
