@@ -1,10 +1,12 @@
 """Returns of policies in the injection environments, with the reduced filter of training.
 
-`python studies/returns.py` runs all built-in policies without privileged information and the
-trained agents on dev:0-31 on two cores, and writes the best of each group to
-eitbench/worlds/returns.csv: the table of an environment's page, and `spec.reward_threshold`.
+`python studies/returns.py [ID …]` runs all built-in policies without privileged information and
+the trained agents on dev:0-31 on two cores, by default in all environments, and writes the best of
+each group to eitbench/worlds/returns.csv: the table of an environment's page, and
+`spec.reward_threshold`.
 """
 
+import sys
 import warnings
 
 import pandas as pd
@@ -48,7 +50,11 @@ def returns(id: str) -> pd.DataFrame:
 
 if __name__ == "__main__":
     warnings.simplefilter("ignore")
-    found = pd.concat([returns(id) for id in builtin_ids() if track_of(id) == "injection"])
+    ids = [id for id in builtin_ids() if track_of(id) == "injection"]
+    asked = sys.argv[1:] or ids
+    kept = pd.read_csv(FILE)
+    found = pd.concat([kept[~kept["environment"].isin(asked)], *map(returns, asked)])
     found = found[["environment", "group", "policy", "mean", "half_width"]].round(4)
+    found = found.sort_values("environment", key=lambda each: each.map(ids.index), kind="stable")
     found.to_csv(FILE, index=False)
     print(found.to_string(index=False), f"\nwrote {FILE.name}")
