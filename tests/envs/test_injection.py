@@ -95,7 +95,7 @@ def test_reward_is_the_decrease_of_the_error(estimator, name):
 
 @pytest.mark.parametrize("history", ["steps", "injections"])
 def test_observations_keep_the_last_steps_or_injections(history):
-    """Steps without an injection shift the currents of the last steps, but not those of the last injections."""
+    """A step without an injection shifts the currents of the last steps, but not the last injections."""
     env = make("reduced", BUDGET, history=history, inflow="learned")
     first = env.reset(seed=2)[0]
     idle, steps = env.unwrapped.rules.action(None), []
