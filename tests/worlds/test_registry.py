@@ -99,7 +99,7 @@ def test_an_id_belongs_to_one_world():
       for id in ("Quiet-v0", "mine/Quiet", "mine/a/Quiet-v0", "mine/Quiet-v0 ", "")),
     (ID, {"gate": 3.0}, "settings of the track estimation must be among lag, assume; got gate"),
     (ID, {"track": "injection", "lag": 3, "assume": {}},
-     "settings of the track injection must be among gate, inflow, faults; got assume, lag"),
+     "settings of the track injection must be among gate, inflow, faults, history; got assume, lag"),
     (ID, {"track": "guessing"}, "track must be one of estimation, injection; got 'guessing'"),
     (ID, {"assume": {"mean_velocity": {1.0}}}, "not JSON"),
     (ID, {"group": "mine"}, r"group must be one of thesis examples, .*; got 'mine'")])
