@@ -130,7 +130,7 @@ def train(
                  "--seeds dev:0-15")
 
 
-@fit.command("prior")
+@fit.command("prior", cls=options.SingleValueCommand)
 def fit_prior(
     env: options.EnvironmentId,
     out: Annotated[Path, typer.Option("--out", "-o", help="File to write, JSON.")],
@@ -166,7 +166,7 @@ def fit_prior(
                     f"{1.0 / prior.regimes.p_end:.1f} steps on average")
 
 
-@fit.command("model")
+@fit.command("model", cls=options.SingleValueCommand)
 def fit_model(
     env: options.EnvironmentId,
     out: Annotated[Path, typer.Option("--out", "-o", help="File to write, npz.")],

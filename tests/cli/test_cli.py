@@ -186,6 +186,7 @@ def test_documented_commands_are_commands():
     (["run", "--env", INJECTION, "--records", "nowhere"], "--records must be a folder, got nowhere"),
     (["policies", "--env", "x"], "use `eitbench run --env ID --policy NAME`"),
     (["bank", "--env", PIPE, "--seeds", "dev:0", "--seeds", "dev:1"], "--seeds may be given once, got 2 times"),
+    (["fit", "prior", "--env", PIPE, "-o", "a", "--out", "b"], "--out may be given once, got 2 times"),
     (["rnu"], "No such command"),
 ])
 def test_mistakes_are_explained(arguments, message, tmp_path):

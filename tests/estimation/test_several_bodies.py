@@ -89,8 +89,8 @@ def test_the_update_is_exact_where_the_other_body_is_known():
 
 
 def test_the_update_is_near_the_joint_posterior():
-    """All 48² pairs of particles: the product of the two posteriors has about its means of the voltages, and less
-    variance, as a mean field does."""
+    """All 48² pairs of particles: the mean voltages of the product are five times nearer to the joint posterior's than
+    the predicted ones, in the mean over 30 measurements."""
     filters, _, measured, base, changes = signals()
     weights = [body.weights[0].copy() for body in filters.bodies]
     noise = filters.model.noise_std(base)[measured[0]]**2
