@@ -150,6 +150,19 @@ class BodyModel:
         weights *= (particles.areas * particles.present)[..., None]
         return index, weights
 
+    def likelihoods(self, cells: tuple[np.ndarray, np.ndarray], weights: np.ndarray,
+                    injection: Injection, residual: np.ndarray,
+                    variance: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return the log-likelihoods (B, P) of a ``residual`` (B, m) in V with this noise
+        ``variance`` (B, m) for particles in `cells`, and for these ``weights`` (B, P) the mean
+        (B, m) and covariance (B, m, m) of what the particles leave of the residual, with noise."""
+        log_likelihood, mean = np.zeros(weights.shape), np.zeros(residual.shape)
+        S = ~injection.used[:, None] * np.eye(residual.shape[1])
+        compiled_kernels().particle_likelihoods(
+            self.signals, *cells, weights, *injection, residual, variance,
+            self.motion.signal_error, log_likelihood, mean, S)
+        return log_likelihood, mean, S
+
     def noise_std(self, voltages: np.ndarray) -> np.ndarray:
         """Return the assumed noise (V) of predicted voltages (..., L), at least a thousandth of the
         largest: voltages near zero would have almost no noise."""
@@ -197,20 +210,6 @@ class BodyParticles:
     def move(self, random: np.random.Generator) -> None:
         """Move the particles by a time step."""
         self.particles, self.weights = self.model.move(self.particles, self.weights, random)
-
-    def likelihoods(self, weights: np.ndarray, injection: Injection, residual: np.ndarray,
-                    variance: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return the log-likelihoods (B, P) of a ``residual`` (B, m) in V with this noise
-        ``variance`` (B, m), and for these ``weights`` of the particles (B, P) the mean (B, m) and
-        covariance (B, m, m) of what the residual and its noise leave."""
-        log_likelihood = np.zeros(weights.shape)
-        mean = np.zeros(residual.shape)
-        S = ~injection.used[:, None] * np.eye(residual.shape[1])
-        model = self.model
-        compiled_kernels().particle_likelihoods(
-            model.signals, *model.cells(self.particles), weights, *injection, residual, variance,
-            model.motion.signal_error, log_likelihood, mean, S)
-        return log_likelihood, mean, S
 
     def posterior(self, log_likelihood: np.ndarray) -> np.ndarray:
         """Return the weights (B, P) after a measurement with these log-likelihoods (B, P)."""
@@ -340,9 +339,11 @@ class BodyParticleFilter:
                     ) -> tuple[list[np.ndarray], np.ndarray, np.ndarray]:
         """Return the weights (B, P) of each body after a measurement of the ``residual`` (B, m) in
         V with the variance ``noise`` (B, m), and its innovation and covariance."""
+        likelihoods = self.model.likelihoods
         weights = [body.weights for body in self.bodies]
-        alone = [body.likelihoods(body.weights, injection, residual, noise)
-                 for body in self.bodies]
+        cells = [self.model.cells(body.particles) for body in self.bodies]
+        alone = [likelihoods(*each, injection, residual, noise)
+                 for each in zip(cells, weights, strict=True)]
         others = len(alone) - 1
         used = injection.used
         without = np.where(used, noise, 1.0)[..., None] * np.eye(used.shape[1])
@@ -357,8 +358,8 @@ class BodyParticleFilter:
                     rest = rest - (residual - mean)
                     variance = variance + (covariance.diagonal(axis1=1, axis2=2) - noise)
                 weights[k] = body.posterior(
-                    body.likelihoods(body.weights, injection, rest, variance)[0])
-                alone[k] = body.likelihoods(weights[k], injection, residual, noise)
+                    likelihoods(cells[k], body.weights, injection, rest, variance)[0])
+                alone[k] = likelihoods(cells[k], weights[k], injection, residual, noise)
         return weights, innovation, S
 
     def mean(self, images: sp.csc_array) -> np.ndarray:

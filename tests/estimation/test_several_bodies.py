@@ -119,11 +119,10 @@ def test_the_filter_follows_two_bubbles():
     rules, seeds = Rules(TWO), [0, 1, 2, 3]
     core = InjectionCore(rules, "reduced")
     core.reset(seeds)
-    pairs = rules.pairs.tolist()
     paths = [TWO.target.paths(TWO, episode_streams(seed).flow) for seed in seeds]
     distances = []
     for k in range(core.length):
-        core.act(np.full(len(seeds), pairs.index(([2, 9], [0, 7], [5, 9])[k % 3])))
+        core.act(np.full(len(seeds), rules.pairs.tolist().index(([2, 9], [0, 7], [5, 9])[k % 3])))
         centres, present = (np.array([[getattr(path, name)[core.t] for path in own] for own in paths])
                             for name in ("centres", "present"))
         distances += matched_distances(core.bodies()[..., :2], centres, present).tolist()

@@ -23,8 +23,7 @@ class BodyFilters(EpisodeFilters):
         return [0] * len(frames)
 
     def _start(self, episodes: int) -> None:
-        model = body_model(self.table.task)
-        self.filter = BodyParticleFilter(model, episodes, self.n_particles)
+        self.filter = BodyParticleFilter(body_model(self.table.task), episodes, self.n_particles)
         self.patches = body_patches(self._rules.world.fault_free)
 
     def _condition(self, voltages: np.ndarray,
