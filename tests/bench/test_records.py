@@ -3,7 +3,6 @@
 import hashlib
 import json
 import os
-import warnings
 
 import jsonschema_rs
 import pytest
@@ -13,7 +12,6 @@ from eitbench.bench.records import (
     MAX_RECORD_DEPTH,
     read_record,
     read_records,
-    record_file_name,
     split_outdated,
     with_content_hash,
     write_record,
@@ -23,8 +21,8 @@ from eitbench.worlds import entry
 
 from tiny import RUN, episode, record, sha, strict
 
-SCHEMA = (bundled_path("leaderboards") / "schema.json").read_text(encoding="utf-8")
-MINE = record("mine", [0.1, 0.25, None], parameters={"alpha": 0.1, "order": [1, 2], "β": 1e-22})
+MINE = record("mine", [0.1, 0.25, None], parameters={"alpha": 0.1, "order": [1, 2], "β": 1e-22},
+              scores={"missed_bubbles_2": -3.5, "nis": None})      # names of scores are arbitrary
 
 
 def changed(path, value, whole=MINE):
@@ -39,17 +37,6 @@ def changed(path, value, whole=MINE):
     else:
         inner[last] = value
     return copy
-
-
-def write_unchecked(folder, content, name=None):
-    """Write a file without checks."""
-    folder.mkdir(exist_ok=True)
-    path = folder / (name or record_file_name(content))
-    path.write_text(json.dumps(content))
-    return path
-
-
-# -- round trip -------------------------------------------------------------------------------------------------------
 
 
 def test_round_trip(tmp_path):
@@ -79,10 +66,9 @@ def test_python_objects_are_written_as_json(tmp_path):
     """Numeric keys and tuples are converted to JSON types before they are hashed, so that the hash is valid."""
     odd = MINE | {"parameters": {10: (1, 2), 9: None}}
     assert read_record(write_record(tmp_path, odd))["parameters"] == {"10": [1, 2], "9": None}
-    with pytest.raises(ValueError, match="record cannot be written as JSON"):
-        write_record(tmp_path, MINE | {"parameters": {"a": float("nan")}})
-    with pytest.raises(ValueError, match="record cannot be written as JSON"):
-        write_record(tmp_path, MINE | {"parameters": {"a": {1, 2}}})
+    for value in (float("nan"), {1, 2}):
+        with pytest.raises(ValueError, match="record cannot be written as JSON"):
+            write_record(tmp_path, MINE | {"parameters": {"a": value}})
 
 
 def test_the_digest_is_as_the_schema_defines():
@@ -90,9 +76,6 @@ def test_the_digest_is_as_the_schema_defines():
     content = {key: value for key, value in MINE.items() if key != "sha256"}
     text = json.dumps(content, sort_keys=True, separators=(",", ":"), ensure_ascii=False)
     assert MINE["sha256"] == hashlib.sha256(text.encode()).hexdigest()
-
-
-# -- rejected records -------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(("path", "value", "message"), [
@@ -133,7 +116,8 @@ def test_violations_are_named(path, value, message, tmp_path):
     with pytest.raises(ValueError, match=message):
         write_record(tmp_path / "new", wrong)
     assert not (tmp_path / "new").exists()
-    file = write_unchecked(tmp_path, with_content_hash(wrong), "it.json")
+    file = tmp_path / "it.json"
+    file.write_text(json.dumps(with_content_hash(wrong)))
     with pytest.raises(ValueError, match=message) as caught:
         read_records(tmp_path)
     assert str(file) in str(caught.value)
@@ -148,13 +132,13 @@ def test_seeds_have_one_name(seed, tmp_path):
         write_record(tmp_path, record("mine", {fine: 0.1}))
 
 
-@pytest.mark.parametrize("run", [RUN | {"dirty": True}, RUN | {"commit": None, "dirty": None}])
-def test_official_records_need_a_clean_commit(run, tmp_path):
+@pytest.mark.parametrize("changes", [{"dirty": True}, {"commit": None, "dirty": None}])
+def test_official_records_need_a_clean_commit(changes, tmp_path):
     """Records from modified code cannot be official."""
-    write_record(tmp_path, record("mine", [0.1], runs=[run]))
+    write_record(tmp_path, record("mine", [0.1], runs=[RUN | changes]))
     write_record(tmp_path, record("mine", [0.1], official=True))
     with pytest.raises(ValueError, match=r"\$\.official: must be false unless all runs are of a commit"):
-        write_record(tmp_path, record("mine", [0.1], runs=[run], official=True))
+        write_record(tmp_path, record("mine", [0.1], runs=[RUN | changes], official=True))
 
 
 @pytest.mark.parametrize(("old", "new"), [("0.25", "0.24"), ("test:1", "test:7"), ("An abacus", "A computer"),
@@ -169,17 +153,9 @@ def test_changes_by_hand_are_caught(old, new, tmp_path):
         read_records(tmp_path)
     path.write_text(json.dumps(json.loads(text)), encoding="utf-8")    # layout is arbitrary
     assert read_records(tmp_path) == [MINE]
-
-
-def test_the_content_determines_the_file_name(tmp_path):
-    """A record cannot be replaced by a file of another name, and cannot exist twice."""
-    path = write_record(tmp_path, MINE)
-    path.rename(tmp_path / path.name.replace("mine", "yours"))
-    with pytest.raises(ValueError, match=f"must have the name {record_file_name(MINE)}"):
+    path.rename(tmp_path / "yours.json")        # a record cannot replace another, or exist twice
+    with pytest.raises(ValueError, match=f"must have the name {path.name}"):
         read_records(tmp_path)
-
-
-# -- versions of environments -----------------------------------------------------------------------------------------
 
 
 def test_other_versions_of_an_environment_are_set_aside(tmp_path):
@@ -189,11 +165,7 @@ def test_other_versions_of_an_environment_are_set_aside(tmp_path):
     write_record(tmp_path, MINE)
     with pytest.warns(UserWarning, match=r"unknown environment eitbench/Pipe2D-v99") as caught:
         assert read_records(tmp_path) == [MINE]
-    assert str(path) in str(caught[0].message)
-    path.unlink()
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        read_records(tmp_path)
+    assert str(path) in str(caught[0].message) and len(caught) == 1
 
 
 def test_only_the_highest_version_of_a_built_in_method_is_current():
@@ -209,28 +181,15 @@ def test_only_the_highest_version_of_a_built_in_method_is_current():
     assert split_outdated(both) == (both, [])                         # digits of a sha256 have no order
 
 
-# -- the schema -------------------------------------------------------------------------------------------------------
-
-
 def test_the_schema_agrees_with_the_code():
     """The schema is valid, and has the subtracks of the code."""
-    schema = json.loads(SCHEMA)
+    schema = json.loads((bundled_path("leaderboards") / "schema.json").read_text(encoding="utf-8"))
     assert jsonschema_rs.meta.is_valid(schema)
     assert schema["$schema"].endswith("2020-12/schema")
     assert tuple(schema["properties"]["board"]["enum"]) == ALL_SUBTRACKS
     assert set(schema["required"]) == set(schema["properties"]) == set(MINE)
     fields = schema["$defs"]["episode"]["properties"]
     assert set(episode("test:0", 0.1)) | {"message", "where", "actions"} == set(fields)
-
-
-def test_scores_are_open(tmp_path):
-    """Registered scores may have any lower-case name, with a finite number or null."""
-    scores = {"error": 0.1, "seconds_per_step": 0.01, "missed_bubbles_2": -3.5, "nis": None}
-    mine = record("mine", [0.1], scores={name: scores[name] for name in ("missed_bubbles_2", "nis")})
-    assert read_record(write_record(tmp_path, mine))["episodes"][0]["scores"] == scores
-
-
-# -- impossible records -----------------------------------------------------------------------------------------------
 
 
 PIPE, LATER, LONG = "eitbench/Pipe2D-v0", "eitbench/Pipe2DFixedLag-v0", "eitbench/Pipe2DSmoothing-v0"
@@ -273,12 +232,11 @@ def test_unknown_arguments_are_rejected(kwargs, message, tmp_path):
 def test_values_that_json_lacks_are_reported_with_the_file(text, place, tmp_path):
     """Numbers that are not finite, half a character, and lists that are nested too deeply are rejected everywhere."""
     mine = record("mine", [7], parameters={"a": 7}, episodes=[episode("test:0", 7) | {"seconds": 7}])
-    path = write_unchecked(tmp_path, mine)
-    content = path.read_text()
+    content = json.dumps(mine)
     assert place in content
-    path.write_text(content.replace(place, place.replace("7", text), 1))
-    with pytest.raises(ValueError, match=f"record .*{path.name} (cannot be read|is not valid)"):
-        read_record(path)
+    (tmp_path / "it.json").write_text(content.replace(place, place.replace("7", text), 1))
+    with pytest.raises(ValueError, match=r"record .*it\.json (cannot be read|is not valid)"):
+        read_record(tmp_path / "it.json")
 
 
 def test_large_and_special_files_are_not_opened(tmp_path):
