@@ -3,11 +3,12 @@
 import re
 
 import pytest
-from eitbench.bench import load, methods, run
+from eitbench.bench import methods, run
 from eitbench.bench.records import read_record, read_records, split_outdated, write_record
 from eitbench.bench.store import EpisodeStore, machine, provenance
 from eitbench.bench.submit import submit
 from eitbench.data.seeds import parse_seeds
+from eitbench.report import compare
 
 from commands import eitbench
 from short import shorten
@@ -43,21 +44,12 @@ def test_a_submission_is_a_record_per_environment(tmp_path):
 
 def test_all_built_in_methods_by_one_command(tmp_path, monkeypatch):
     """All compatible methods run, by environment: finished environments have records after an interruption."""
-    monkeypatch.setattr(run, "builtin_methods", lambda track: ["persistence", "fixed_interval_smoother"])
+    monkeypatch.setattr(run, "builtin_methods", lambda track: ["persistence", "inflow_smoother"])
     made = submit(None, [FILTER.id, SMOOTHING.id], TEST[:1], EpisodeStore(tmp_path / "r"), tmp_path / "to")
     assert "--persistence--" in next(made).name
     assert [path.name.split("--")[1] for path in (tmp_path / "to").iterdir()] == ["persistence"]
     assert sorted(path.name.split("--")[:2] for path in made) == [
-        [SMOOTHING.id.replace("/", "-"), name] for name in ("fixed_interval_smoother", "persistence")]
-
-
-def test_failures_are_submitted_too(tmp_path):
-    """A method with a failed episode has a record with the failure."""
-    fails = write_baseline(tmp_path, update="assert self.calls < 2, 'dry'\n        return Estimate(self.level)")
-    (path,) = submit(fails, [FILTER.id], TEST, EpisodeStore(tmp_path), tmp_path / "to", isolate="none")
-    episodes = read_record(path)["episodes"]
-    assert [(e["status"], e["message"]) for e in episodes] == 2 * [("failed", "AssertionError: dry")]
-    assert load(tmp_path / "to")["value"].isna().all() and len(load(tmp_path / "to")) == 2
+        [SMOOTHING.id.replace("/", "-"), name] for name in ("inflow_smoother", "persistence")]
 
 
 def test_policies_by_command(tmp_path):
@@ -177,8 +169,9 @@ def test_invalid_results_are_not_submitted(tmp_path, monkeypatch):
     assert not (tmp_path / "leaderboards").exists()
 
 
-def test_from_a_file_to_the_leaderboards_by_command(tmp_path):
+def test_from_a_file_to_the_leaderboards_by_command(tmp_path, monkeypatch):
     """The commands submit, leaderboard and compare work as README describes."""
+    monkeypatch.setattr(compare, "BUNDLED_RECORDS", tmp_path)              # reading all records takes seconds
     write_baseline(tmp_path)
     common = ("--env", FILTER.id, "--seeds", "test:0-6", "-j", "1")
     code, said, complaint = eitbench("submit", "--baseline", "mine.py", *common)
