@@ -40,9 +40,6 @@ def environment(name: str) -> InjectionEnv:
     return runner.cached_environment(Environment(name, json.dumps(KWARGS[name] | {"estimator": "reduced"})))
 
 
-# -- belief -----------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("name", [NAME, INFLOW, FAULTS, BUDGET, FLOW])
 def test_belief_is_the_filter_inside(name):
     """A belief that a policy updates equals the environment's reduced filter, to the bit."""
@@ -116,9 +113,6 @@ def test_the_prior_belief_is_the_expected_concentration():
                                atol=0.02 * np.abs(belief.jacobian).max())
 
 
-# -- rules ------------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("name", list(KWARGS))
 def test_the_action_of_a_pair_injects_it(name):
     """A pair's action injects its currents in every world; the action without injection has no current."""
@@ -162,9 +156,6 @@ def test_slug_triggered_follows_a_slug_and_rests_after_it():
         injected += [k] * (action != idle)
     assert injected[:11] == [5, 11, 14, 25, 28, 31, 34, 37, 40, 51, 58]
     assert len(injected) == 30 and injected[-1] == 174
-
-
-# -- rollouts ---------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("name", [CURRENTS, BUDGET, FLOW, TANK])
@@ -226,9 +217,6 @@ def test_errors_of_policies_are_ordered_and_pool_trainings():
     assert gap_text(rows[rows["policy"] == "random_pair"]) == ""
 
 
-# -- errors -----------------------------------------------------------------------------------------------------------
-
-
 def test_unknown_names_are_reported(tmp_path):
     """Unknown policies, environments and estimators are reported, and a file without a policy."""
     (tmp_path / "mine.py").write_text("class Policy: pass")
@@ -240,9 +228,6 @@ def test_unknown_names_are_reported(tmp_path):
             (NAME, SHORT, "adjacent", "none", "estimator must be one of full, reduced; got 'none'")):
         with pytest.raises(ValueError, match=message):
             injected(name, kwargs, policy, 1, estimator)
-
-
-# -- adaptivity gap ---------------------------------------------------------------------------------------------------
 
 
 def hand_made(**errors: list[float]) -> pd.DataFrame:

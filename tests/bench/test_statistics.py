@@ -43,18 +43,12 @@ def plain(scores):
     return {environment: list(own.values()) for environment, own in scores.items()}
 
 
-# -- interquartile mean -----------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("n", range(1, 30))
 def test_interquartile_mean_is_scipys(n):
     """It is the 25 % trimmed mean of the pooled environments, also for several resamples at once."""
     scores = np.random.default_rng(n).normal(size=(4, n))
     assert interquartile_mean(scores) == pytest.approx(stats.trim_mean(scores, 0.25, axis=1), rel=1e-12)
     assert interquartile_mean(*scores) == pytest.approx(stats.trim_mean(scores, 0.25, axis=None), rel=1e-12)
-
-
-# -- bootstrap --------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(("n", "statistic", "expected"), [
@@ -93,9 +87,6 @@ def test_too_few_episodes_have_no_interval():
     value, low, high = stratified_bootstrap({"pipe": a[:2], "tank": b[:4]}, mean_over_environments)
     assert value == 1.0 and 0.0 <= low < 1.0 < high <= 2.0
     assert paired_probability_of_improvement({"pipe": seeded(a)}, {"pipe": seeded(a + 1)}) == (1.0, 0.0, 1.0)
-
-
-# -- pairs ------------------------------------------------------------------------------------------------------------
 
 
 def test_difficulty_of_episodes_cancels():
@@ -174,9 +165,6 @@ def test_paired_probability_of_improvement():
     assert paired_probability_of_improvement(one, one) == (0.5, 0.5, 0.5)
 
 
-# -- ranks ------------------------------------------------------------------------------------------------------------
-
-
 NOISE = np.tile([-1.0, 1.0], 6)
 
 
@@ -252,9 +240,6 @@ def test_ranks_agree_with_the_definition(statistic, higher):
         assert found == by_the_definition(scores, statistic, higher), seed
         values = [statistic(*(list(own.values()) for own in scores[name].values())) for name in found]
         assert values == pytest.approx(sorted(values, reverse=higher), rel=1e-12)
-
-
-# -- errors -----------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(("call", "message"), [

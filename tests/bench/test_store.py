@@ -51,9 +51,6 @@ def failed(seed):
     return made | {"status": "failed", "message": "broke", "where": "mine.py:1"}
 
 
-# -- episodes ---------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("number", [math.nan, math.inf, -math.inf])
 def test_numbers_that_json_lacks_are_rejected(number, store):
     """NaN and Infinity are rejected before any file is replaced."""
@@ -79,9 +76,6 @@ def test_concurrent_writers_lose_nothing(store):
     assert [len(record["episodes"]) for record in store.write_records()] == [16, 16]
     assert not [path for path in store.folder.rglob(".*") if path.is_file()]
     assert all((store.fields(each)["mean"] == int(each["seed"].split(":")[1])).all() for each in store.results())
-
-
-# -- records ----------------------------------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")

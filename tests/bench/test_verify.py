@@ -102,9 +102,6 @@ def own(submission, tmp_path):
     return path
 
 
-# -- reruns -------------------------------------------------------------------------------------
-
-
 def test_a_valid_record_agrees():
     """Episodes are simulated again and chosen by the seed; the output is a Markdown table."""
     path = submitted("homogeneous", "test:0-3")
@@ -225,9 +222,6 @@ def test_the_cache_is_not_used(tmp_path, monkeypatch):
     assert cache_folder() == tmp_path / "cache"
 
 
-# -- many records -------------------------------------------------------------------------------
-
-
 def test_all_official_records_are_verified_and_a_false_one_is_reported(monkeypatch):
     """A repeated command resumes. Damaged files are reported before any episode is run."""
     for env in (FILTER.id, SMOOTHING.id):
@@ -258,9 +252,6 @@ def test_the_first_records_of_a_board_are_chosen(own):
         verification.select_records(own.parent, [INJECTION], top=1)
 
 
-# -- recorded actions ---------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("env", [INJECTION, CURRENTS])
 def test_recorded_actions_are_replayed_without_the_policy(env, monkeypatch):
     """For pairs and currents, other actions give other scores, and a missing action is reported."""
@@ -288,9 +279,6 @@ def test_recorded_actions_are_replayed_without_the_policy(env, monkeypatch):
     paths = [changed(path, change, f"{k}/results") for k, change in enumerate(changes.values())]
     code, _, complaint = eitbench("verify", *paths, "--replay", "-j", 1)
     assert code == 1 and all(re.search(message, complaint) for message in changes), complaint
-
-
-# -- held-out episodes --------------------------------------------------------------------------
 
 
 def write_secret(secret=SECRET, mode=0o600):
@@ -363,9 +351,6 @@ def test_records_of_the_baseline_are_not_used():
     assert not problems and row["recorded"] == "1 (6)" and row["held-out"] == "1 (4)" and float(row["p"]) == 1.0
     with pytest.raises(ValueError, match="must be more for a test, got 1 and 6"):
         held_out.verify_held_out(read_record(path), Job(FILTER._replace(kwargs="{}"), "homogeneous", 0), SECRET, 1)
-
-
-# -- the command --------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(("arguments", "message"), [

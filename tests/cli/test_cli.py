@@ -48,9 +48,6 @@ def tiny_world(monkeypatch, tmp_path):
     (tmp_path / "mine.py").write_text(MINE)
 
 
-# -- run and leaderboard ----------------------------------------------------------------------------------------------
-
-
 def test_a_users_file_has_a_table_and_a_page(tmp_path):
     """A user's file is run, scored and shown next to built-in methods: on the terminal, as Markdown, HTML and JSON."""
     assert len(MINE.splitlines()) <= 10
@@ -106,9 +103,6 @@ def test_agents_of_two_environments_may_have_one_name(tmp_path, monkeypatch):
         run.make_jobs("estimation", pair[:1], [job.method for job in jobs], [1], isolate="none")
 
 
-# -- help -------------------------------------------------------------------------------------------------------------
-
-
 def test_list():
     """The list has every environment with its subtrack, and every method with its subtracks and title."""
     code, said, _ = eitbench("list")
@@ -156,9 +150,6 @@ def test_documented_commands_are_commands():
     assert {command.split()[0] for command in named} == set(COMMANDS)
     for command, options in named.items():
         assert all(re.search(rf"{option}\b", helps[command]) for option in options), (command, options)
-
-
-# -- errors -----------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(("arguments", "message"), [

@@ -129,9 +129,6 @@ def test_a_round_pipe_is_cut_along_its_axis():
     assert np.abs(middle[20] - middle[-20]).max() > 100
 
 
-# -- charts -----------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("values", [[0.1], [0.1, 0.1], [0.2, 0.0, 0.3]], ids=["one step", "constant", "a zero"])
 def test_odd_values_can_be_drawn(values):
     """One step, no change and a perfect estimate are within the chart, as curves and marks."""

@@ -34,9 +34,6 @@ def row(records, method, board):
                 for row in each.rows if row.cells["method"] == method)
 
 
-# -- statistics -------------------------------------------------------------------------------------------------------
-
-
 @given(st.lists(st.floats(0.001, 100.0), min_size=2, max_size=30))
 def test_interval_is_students(values):
     """Mean and half width of the 95 % interval equal scipy.stats."""
@@ -74,9 +71,6 @@ def test_rounding_stays_within_the_interval(mean, part):
                                            (999.6, "1000"), (3078.2, "3078"), (0.0, "0"), (-1.234, "-1.23")])
 def test_numbers_are_short_and_never_powers_of_ten(value, text):
     assert format_number(value) == text
-
-
-# -- skill ------------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("board", ["filter", "fixed-lag", "smoothing"])
@@ -117,9 +111,6 @@ def test_anchors_look_back_on_the_longest_made(official):
         assert row([*records, mine], "mine", "filter")["skill"] == pytest.approx(expected)
 
 
-# -- environments -----------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(("id", "kwargs", "name", "title"), [
     ("eitbench/Pipe2DFixedLag-v0", {}, "Pipe2D", "Pipe2DFixedLag-v0"),
     ("eitbench/Pipe3DSmoothing-v0", {"lag": "all", "world": None}, "Pipe3D", "Pipe3DSmoothing-v0 (lag=all)"),
@@ -150,9 +141,6 @@ def test_all_episodes_of_a_run_are_shown():
     mine = row(records, "mine", "filter")
     assert mine["seeds"] == "test:0-4" and mine["error"] == pytest.approx(0.01)
     assert mine["gain"] == pytest.approx(1 - 0.01 / 0.022, rel=0.01)
-
-
-# -- tables -----------------------------------------------------------------------------------------------------------
 
 
 def test_failures_are_counted_not_averaged():

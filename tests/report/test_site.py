@@ -53,9 +53,6 @@ def site(rendered):
     return rendered(several_boards())
 
 
-# -- up to date, reproducible -----------------------------------------------------------------------------------------
-
-
 def test_published_files_are_rendered_from_the_records():
     """`eitbench leaderboard --records leaderboards/results` changes nothing; the site has a limited size."""
     folder = ROOT / "leaderboards"
@@ -88,9 +85,6 @@ def test_writing_a_site_replaces_a_site_and_nothing_else(tmp_path):
         with pytest.raises(ValueError, match="folder must be empty or hold a site of the leaderboards"):
             write_site(tmp_path / name, files)
         assert (tmp_path / name / name).read_text() == "<strong>mine</strong>"
-
-
-# -- equal to the leaderboards -----------------------------------------------------------------------------------------
 
 
 def rows_of(html, anchor):
@@ -177,8 +171,6 @@ def test_every_environment_is_documented():
         assert len(first) > 100 and "<table>" not in first and "<table>" in rest and "<h2>" not in first + rest, id
 
 
-# -- training seeds, oracles -------------------------------------------------------------------------------------------
-
 LEVEL = np.array([0.20, 0.24, 0.22, 0.26, 0.18, 0.30])
 SEEDS = {0: 0.50, 1: 0.56, 2: 0.47}
 """Training seed -> error relative to the naive baseline."""
@@ -244,8 +236,6 @@ def test_an_outperformed_reference_is_marked():
     assert badges["Seer"] == ("oracle", "privileged", "outperformed here by 2 others", "self-reported")
     assert badges["Oracle"] == ("oracle", "privileged", "self-reported")
 
-
-# -- robustness, headline ---------------------------------------------------------------------------------------------
 
 HOME, SHORT, NOISE = BOARD_IDS["filter"], "eitbench/Pipe2DShortSlugs-v0", "eitbench/Pipe2DDoubleNoise-v0"
 
@@ -322,9 +312,6 @@ def test_no_headline_where_it_would_not_be_true(errors, official, rendered):
     """A missing method, a ratio out of range, or self-reported records give no headline."""
     records = headlined(errors, official)
     assert headline(collect(records)) is None and "<figure>" not in rendered(records)["index.html"]
-
-
-# -- links and charts -------------------------------------------------------------------------------------------------
 
 
 def test_every_link_resolves(tmp_path, monkeypatch):
