@@ -6,10 +6,15 @@ from eitbench.cli.app import app
 from typer.testing import CliRunner
 
 
-def eitbench(*arguments):
-    """Return exit code, standard output, and standard error without boxes and line breaks; raise errors that a user
-    would get as a traceback."""
+def run(*arguments):
+    """Return exit code, standard output and standard error; raise errors that a user would get as a traceback."""
     done = CliRunner().invoke(app, list(map(str, arguments)))
     if done.exception is not None and not isinstance(done.exception, SystemExit):
         raise done.exception
-    return done.exit_code, done.stdout, re.sub(r"[│╭╮╰╯─\s]+", " ", done.stderr)
+    return done.exit_code, done.stdout, done.stderr
+
+
+def eitbench(*arguments):
+    """Return the same, with standard error without boxes and line breaks."""
+    code, said, complaint = run(*arguments)
+    return code, said, re.sub(r"[│╭╮╰╯─\s]+", " ", complaint)

@@ -3,11 +3,12 @@
 import gymnasium as gym
 import numpy as np
 import pytest
+from eitbench.bench.methods import load_method
 from eitbench.bench.minari_export import export_minari
-from eitbench.cli.app import app
+from eitbench.bench.runner import iter_injections
 from eitbench.worlds.registry import published_returns
-from typer.testing import CliRunner
 
+from commands import eitbench
 from short import shorten
 
 minari = pytest.importorskip("minari", reason="needs the extra minari")
@@ -47,8 +48,6 @@ def test_replaying_gives_the_same_again():
 
 def test_the_policy_has_the_same_random_stream_as_in_runs():
     """The random stream is the same: injections equal those in `eitbench run`."""
-    from eitbench.bench.methods import load_method
-    from eitbench.bench.runner import iter_injections
     export_minari(NAME, ENV, "random_pair", "dev:3")
     (episode,) = minari.load_dataset(NAME).iterate_episodes()
     env = gym.make(ENV, observation="raw").unwrapped
@@ -71,10 +70,10 @@ def test_mistakes(given, said, tmp_path):
 
 def test_command_and_existing_name():
     line = ["export", "--format", "minari", "--env", ENV, "--seeds", "train:0", "--out", NAME, "-j", "1"]
-    told = CliRunner().invoke(app, line)
-    assert told.exit_code != 0 and "policy must be given with format minari" in told.output
+    code, _, complaint = eitbench(*line)
+    assert code == 2 and "policy must be given with format minari" in complaint
     line += ["--policy", "random_pair"]
-    told = CliRunner().invoke(app, line)
-    assert told.exit_code == 0 and "1 episodes written" in told.output, told.output
-    told = CliRunner().invoke(app, line)
-    assert told.exit_code != 0 and "out must be the name of a new data set" in told.output
+    code, said, complaint = eitbench(*line)
+    assert code == 0 and "1 episodes written" in said, complaint
+    code, _, complaint = eitbench(*line)
+    assert code == 2 and "out must be the name of a new data set" in complaint

@@ -6,6 +6,7 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
+import gymnasium as gym
 import pytest
 from eitbench import __version__
 from eitbench.bench import run, tracks
@@ -24,16 +25,25 @@ ROOT = Path(__file__).parents[2]
 PIPE, INJECTION = "eitbench/Pipe2D-v0", "eitbench/Pipe2DInjection-v0"
 COMMANDS = ("list", "run", "bank", "train", "submit", "verify", "golden",
             "fit", "estimate", "fetch", "export", "leaderboard", "compare", "render")
-MINE = '''"""My method: the expected level everywhere."""
-import numpy as np
-from eitbench import Estimate
+WORLD = '''
+from dataclasses import dataclass
 
-class Estimator:
-    def __init__(self, task):
-        self.level = np.full(task.mesh.n_nodes, task.expected_concentration)
+from eitbench.worlds import World, register
+from eitbench.worlds.flows import LaminarFlow
+from eitbench.worlds.slugs import Slugs
+from eitbench.worlds.vessels import PlanePipe
+from eitbench.worlds.schedule import Schedule
 
-    def update(self, voltages, currents):
-        return Estimate(self.level)
+
+@dataclass(frozen=True)
+class FastFlow(LaminarFlow):
+    """A class that only this file defines."""
+
+    mean_velocity: float = 45.0
+
+
+register(World("Fast", PlanePipe(electrodes_per_wall=2), FastFlow(), Slugs(), schedule=Schedule(scored_steps=4)),
+         "mine/Fast-v0")
 '''
 
 
@@ -45,12 +55,11 @@ def tiny_world(monkeypatch, tmp_path):
     lagged = replace(entry("eitbench/Pipe2DFixedLag-v0"), settings={"lag": 2})
     registry.import_entries([lagged])
     monkeypatch.chdir(tmp_path)
-    (tmp_path / "mine.py").write_text(MINE)
+    write_baseline(tmp_path, doc="My method: the same everywhere.")
 
 
 def test_a_users_file_has_a_table_and_a_page(tmp_path):
     """A user's file is run, scored and shown next to built-in methods: on the terminal, as Markdown, HTML and JSON."""
-    assert len(MINE.splitlines()) <= 10
     code, said, _ = eitbench("run", "--env", PIPE, "--baseline", "mine.py", "--baseline", "homogeneous",
                              "--seeds", "dev:0-1", "-j", "1")
     assert code == 0 and "| mine " in said and "| homogeneous " in said
@@ -69,13 +78,12 @@ def test_a_users_file_has_a_table_and_a_page(tmp_path):
     assert (results / "leaderboard.md").read_text(encoding="utf-8") == table and (results / "index.html").exists()
 
 
-def test_suites(tmp_path):
+def test_suites():
     """full has every environment; quick the plain pipe with fewer seeds, without methods that take minutes. Methods
     fitted to a real pipe are incompatible with tiny worlds. A user's file has a job for each of its subtracks."""
-    subtracks = "class Estimator:\n    subtracks = ('filter', 'smoothing')"
-    (tmp_path / "mine.py").write_text(MINE.replace("class Estimator:", subtracks))
     jobs = run.make_jobs("estimation", [], ["mine.py"], [1], suite="quick")
-    assert [job.environment.id for job in jobs] == [PIPE, "eitbench/Pipe2DSmoothing-v0"]
+    assert [job.environment.id for job in jobs] == [
+        PIPE, "eitbench/Pipe2DFixedLag-v0", "eitbench/Pipe2DSmoothing-v0"]
     quick, full = (run.make_jobs("estimation", [], [], [1], suite=suite) for suite in ("quick", "full"))
     plain = set(PLAIN) & set(ids("estimation"))
     assert {job.environment.id for job in quick} == plain and len(plain) == 3
@@ -90,6 +98,22 @@ def test_suites(tmp_path):
     assert min(parse_seeds(entry(PIPE).test_seeds)) == 200_000
     asked_for = run.make_jobs("estimation", [PIPE], ["gauss_newton"], [1, 2], suite="quick")
     assert [job.seed for job in asked_for] == [1, 2]
+
+
+@pytest.fixture
+def module(tmp_path):
+    """A file that registers a world."""
+    (tmp_path / "my_world_of_tests.py").write_text(WORLD)
+    yield "my_world_of_tests"
+    sys.modules.pop("my_world_of_tests", None)
+    gym.registry.pop("mine/Fast-v0", None)
+
+
+def test_a_world_of_a_file_runs(module):
+    """On two processes, and in a worker of an isolated method."""
+    code, said, complaint = eitbench("run", "--env", f"{module}:mine/Fast-v0", "--baseline", "mine.py", "--seeds",
+                                     "dev:0-1", "-j", "2", "--isolate", "process")
+    assert code == 0 and "Fast-v0" in said and "failed" not in said, complaint
 
 
 def test_agents_of_two_environments_may_have_one_name(tmp_path, monkeypatch):
@@ -164,8 +188,8 @@ def test_documented_commands_are_commands():
     (["run", "--baseline", "mine.py", "--baseline", "other/mine.py", "--seeds", "dev:1", "-j", "1"], "other/mine.py"),
     (["run", "--baseline", "empty.py"], "empty.py must define a class Estimator with a method update"),
     (["run", "--baseline", "broken.py"], "broken.py"),
-    (["run", "--baseline", "mine.py", "--env", "eitbench/Pipe2DSmoothing-v0"],
-     "baseline mine.py suits none of the environments"),
+    (["run", "--baseline", "kalman_filter", "--env", "eitbench/Pipe2DSmoothing-v0"],
+     "baseline kalman_filter suits none of the environments"),
     (["leaderboard", "-o", "nothing"], "no results in nothing; create some with `eitbench run`"),
     (["render", "--step", "3"], "out must end in .png with step"),
     (["render", "--baseline", "fixed_interval_smoother"], "not compatible with eitbench/Pipe2D-v0, a filter"),
@@ -178,14 +202,17 @@ def test_documented_commands_are_commands():
     (["policies", "--env", "x"], "use `eitbench run --env ID --policy NAME`"),
     (["bank", "--env", PIPE, "--seeds", "dev:0", "--seeds", "dev:1"], "--seeds may be given once, got 2 times"),
     (["fit", "prior", "--env", PIPE, "-o", "a", "--out", "b"], "--out may be given once, got 2 times"),
+    (["bank", "--env", "nowhere:mine/Fast-v0"],
+     "module nowhere of nowhere:mine/Fast-v0 cannot be imported: ModuleNotFoundError"),
+    (["bank", "--env", "broken_world:mine/Fast-v0"], "ZeroDivisionError: division by zero"),
     (["rnu"], "No such command"),
 ])
 def test_mistakes_are_explained(arguments, message, tmp_path):
     """Exit code 2 and a sentence with the argument; no traceback, and no file is written."""
     (tmp_path / "empty.py").write_text("")
     (tmp_path / "broken.py").write_text("class Estimator(:")
-    (tmp_path / "other").mkdir()
-    (tmp_path / "other" / "mine.py").write_text(MINE)
+    (tmp_path / "broken_world.py").write_text("1 / 0\n")
+    write_baseline(tmp_path / "other")
     code, said, complaint = eitbench(*arguments)
     assert code == 2 and said == ""
     assert message in complaint and "Traceback" not in complaint

@@ -4,10 +4,9 @@ import re
 
 import pytest
 from eitbench.bench.variants import flatten, variants
-from eitbench.cli.app import app
 from eitbench.report.sweep import swept_parameter
-from typer.testing import CliRunner
 
+import commands
 from short import shorten
 from tiny import git_says, write_baseline
 
@@ -24,12 +23,9 @@ def tiny_world(monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
 
 
-def run(*arguments, command="run"):
-    """Return exit code, standard output, standard error."""
-    done = CliRunner().invoke(app, [command, "--env", PIPE, "--seeds", "dev:0-1", "-j", "1", *arguments])
-    if done.exception is not None and not isinstance(done.exception, SystemExit):
-        raise done.exception                                           # a user would see a traceback
-    return done.exit_code, done.stdout, done.stderr
+def run(*arguments):
+    """Run two dev episodes of the world; see `commands.run`."""
+    return commands.run("run", "--env", PIPE, "--seeds", "dev:0-1", "-j", "1", *arguments)
 
 
 @pytest.mark.parametrize("isolate", ["process", "none"])
@@ -126,9 +122,3 @@ def test_variants(settings, worlds):
 def test_invalid_settings(settings, message):
     with pytest.raises(ValueError, match=re.escape(message)):
         variants(settings)
-
-
-def test_unknown_settings_of_a_world_are_reported(tmp_path):
-    """The error precedes all runs and writing."""
-    code, _, complaint = run("--set", "instrument.noise=0.02")
-    assert code == 2 and "noise_relative" in complaint and not (tmp_path / "results").exists()

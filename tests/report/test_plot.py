@@ -15,7 +15,7 @@ from short import world
 
 matplotlib.use("Agg")
 PIPE, TANK, SOLID = "eitbench/Pipe2D-v0", "eitbench/RotatingTank2D-v0", "eitbench/Pipe3D-v0"
-INJECTION = "eitbench/Pipe2DInjection-v0"
+INJECTION = "eitbench/TankTracking-v0"
 
 
 @pytest.fixture(autouse=True)
@@ -64,8 +64,7 @@ def test_a_field_of_another_mesh_is_rejected():
 
 
 def test_an_episode_shows_truth_and_estimate():
-    """Plots show truth and estimate at the times of the titles; ẽ_c is the
-    score."""
+    """Plots show truth and estimate at the times of the titles; ẽ_c is the score."""
     given = world(PIPE)["world"]
     axes = eitbench.plot.episode("homogeneous", PIPE, "dev:0", world=given, times=2)
     assert axes.shape == (2, 2)
@@ -84,12 +83,12 @@ def test_an_episode_shows_truth_and_estimate():
 def test_an_episode_of_a_policy():
     axes = eitbench.plot.episode("random_pair", INJECTION, 3, world=world(INJECTION)["world"], times=1)
     assert axes.shape == (1, 2) and "random_pair, ẽ_c =" in axes[0, 1].get_title()
-    with pytest.raises(ValueError, match="times must be an integer of at least 1 and at most 3, got 6"):
-        eitbench.plot.episode("homogeneous", PIPE, 3, world=world(PIPE)["world"], times=6)
-    with pytest.raises(ValueError, match="method fixed_interval_smoother for smoothing is not compatible"):
-        eitbench.plot.episode("fixed_interval_smoother", PIPE, 3, world=world(PIPE)["world"], times=1)
-    with pytest.raises(ValueError, match="seed must name one episode, as in 'dev:0', got 'dev:0-1'"):
-        eitbench.plot.episode("homogeneous", PIPE, "dev:0-1", world=world(PIPE)["world"])
+    for method, seed, times, message in [
+            ("homogeneous", 3, 6, "times must be an integer of at least 1 and at most 3, got 6"),
+            ("fixed_interval_smoother", 3, 1, "method fixed_interval_smoother for smoothing is not compatible"),
+            ("homogeneous", "dev:0-1", 1, "seed must name one episode, as in 'dev:0', got 'dev:0-1'")]:
+        with pytest.raises(ValueError, match=message):
+            eitbench.plot.episode(method, PIPE, seed, world=world(PIPE)["world"], times=times)
 
 
 def test_methods_are_compared_best_first():
