@@ -1,4 +1,4 @@
-"""Networks trained elsewhere, as agents, policies and estimators: from weights to a record."""
+"""Networks trained elsewhere, as agents and policies: from weights to a record."""
 
 import json
 
@@ -21,7 +21,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 from short import shorten, world
 from tiny import git_says
 
-NAME, FILTER = "eitbench/Pipe2DInjection-v0", "eitbench/Pipe2D-v0"
+NAME = "eitbench/Pipe2DInjection-v0"
 SHORT = world(NAME)
 POLICY = '''"""A network in the style of CleanRL."""
 from pathlib import Path
@@ -45,36 +45,20 @@ class Policy(AgentPolicy):
             logits = self.actor(torch.as_tensor(observation))
         return int(logits.masked_fill(~torch.as_tensor(mask), -torch.inf).argmax())
 '''
-ESTIMATOR = '''"""A network as an estimator."""
-from pathlib import Path
-
-import torch
-from eitbench import Estimate
-
-
-class Estimator:
-    files = ("weights.pt",)
-
-    def __init__(self, task):
-        self.weights = torch.load(Path(__file__).with_name("weights.pt"), weights_only=True)
-
-    def update(self, voltages, currents):
-        return Estimate((self.weights["matrix"] @ torch.as_tensor(voltages)).numpy())
-'''
 
 
 @pytest.fixture(autouse=True)
 def short_episodes(monkeypatch, tmp_path):
     """Make the episodes of the registered environments short, and submit from a clean commit."""
     git_says(monkeypatch, "c0ffee")
-    shorten(monkeypatch, FILTER, NAME)
+    shorten(monkeypatch, NAME)
     monkeypatch.chdir(tmp_path)
 
 
-def assert_submits(method, id, tmp_path):
+def assert_submits(method, tmp_path):
     """A record of one test episode that finished."""
-    (path,) = submit(str(method), [id], parse_seeds("test:0"), EpisodeStore(tmp_path / "results"), tmp_path / "to",
-                     policy=id == NAME, isolate="none")
+    (path,) = submit(str(method), [NAME], parse_seeds("test:0"), EpisodeStore(tmp_path / "results"), tmp_path / "to",
+                     policy=True, isolate="none")
     record = read_record(path)
     assert [each["status"] for each in record["episodes"]] == ["ok"]
     return record
@@ -104,7 +88,7 @@ def test_a_model_of_stable_baselines3_is_an_agent(estimator, tmp_path):
     assert method.name.startswith("ppo_") and method.parameters == {"env": NAME, "total_steps": 16}
     actions, seen = rollout(method, estimator=estimator)
     assert [int(each) for each in actions] == [int(model.predict(each, deterministic=True)[0]) for each in seen]
-    assert assert_submits(path, NAME, tmp_path)["method"] == method.name
+    assert assert_submits(path, tmp_path)["method"] == method.name
 
 
 def test_names_of_saved_agents(tmp_path):
@@ -124,7 +108,7 @@ def test_what_is_no_agent_is_refused(tmp_path):
     model = PPO("MlpPolicy", env)
     for each, place, message in [
             (TRPO("MlpPolicy", env), env, "model must be of one of the classes PPO, .*got TRPO"),
-            (model, FILTER, "env must be the id of an injection environment"),
+            (model, "eitbench/Pipe2D-v0", "env must be the id of an injection environment"),
             (model, gym.make("CartPole-v1"), "env must be one of eitbench/"),
             (PPO("MlpPolicy", VecNormalize(DummyVecEnv([lambda: env]))), NAME, "got normalised ones"),
             (PPO("MlpPolicy", gym.wrappers.NormalizeObservation(env)), NAME, "got normalised ones"),
@@ -158,28 +142,21 @@ def test_a_policy_reads_the_files_that_its_class_names(policy, tmp_path):
         assert isolated.sha256 == method.sha256 and rollout(isolated)[0] == actions
     finally:
         close()
-    assert assert_submits(policy, NAME, tmp_path)["method_sha256"] == method.sha256
+    assert assert_submits(policy, tmp_path)["method_sha256"] == method.sha256
 
 
 def test_a_method_is_its_file_and_the_files_it_names(policy, tmp_path):
-    """Other weights are another version; a file that is missing or lies elsewhere is named."""
-    before = load_method(str(policy), "injection").sha256
+    """Other weights are another version of policies and estimators; a missing file, or one elsewhere, is named."""
+    estimator = tmp_path / "network.py"
+    estimator.write_text('class Estimator:\n    files = ("agent.pt",)\n    update = print\n')
+    methods = ((str(policy), "injection"), (str(estimator), "estimation"))
+    before = [load_method(*method).sha256 for method in methods]
     weights = torch.load(tmp_path / "agent.pt", weights_only=True)
     torch.save({name: 2 * value for name, value in weights.items()}, tmp_path / "agent.pt")
-    assert load_method(str(policy), "injection").sha256 != before
+    assert all(load_method(*method).sha256 != old for method, old in zip(methods, before, strict=True))
     for text, message in [('("agent.pt", "other.npz")', "files must name files in the folder of the method, got 'oth"),
                           ('("../agent.pt",)', "files must name files in the folder"),
                           ('"agent.pt"', "files must be a literal tuple of names")]:
         policy.write_text(POLICY.replace('("agent.pt",)', text))
         with pytest.raises(ValueError, match=message):
             load_method(str(policy), "injection")
-
-
-def test_a_torch_estimator_reads_its_weights(tmp_path):
-    """Weights in a file become a record."""
-    env = gym.make(FILTER, **SHORT)
-    shape = env.action_space.shape[0], env.observation_space["voltages"].shape[0]
-    matrix = torch.full(shape, 1e-3, dtype=torch.float64)
-    torch.save({"matrix": matrix}, tmp_path / "weights.pt")
-    (tmp_path / "network.py").write_text(ESTIMATOR)
-    assert_submits(tmp_path / "network.py", FILTER, tmp_path)

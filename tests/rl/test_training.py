@@ -8,6 +8,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from eitbench.bench.methods import load_method
+from eitbench.bench.runner import iter_injections
 from eitbench.envs.injection import InjectionVectorEnv
 from eitbench.estimation.onboard.rules import Rules
 from eitbench.rl import training
@@ -20,17 +21,15 @@ from stable_baselines3.common.monitor import load_results
 from threadpoolctl import threadpool_limits
 
 from commands import eitbench
-from injection_envs import injected
+from injection_envs import BUDGET, CURRENTS, NAME, injected
 from short import merged, shorten, world
 
-NAME = "eitbench/Pipe2DInjection-v0"
-CURRENTS, BUDGET = "eitbench/Pipe2DInjectionCurrents-v0", "eitbench/Pipe2DInjectionBudget-v0"
 SHORT = world(NAME)
 """An episode with six steps of the agent."""
 TINY = TrainingConfig(total_steps=32, n_envs=2, interval=16, evaluation_episodes=2, episodes=3, hidden=(8,),
               algorithm={"n_steps": 8, "batch_size": 8})
-RUNS = {"ppo": (NAME, {"n_steps": 8, "batch_size": 8}), "maskable_ppo": (BUDGET, {"n_steps": 8, "batch_size": 8}),
-        "recurrent_ppo": (NAME, {"n_steps": 8, "batch_size": 8}),
+RUNS = {"ppo": (NAME, TINY.algorithm), "maskable_ppo": (BUDGET, TINY.algorithm),
+        "recurrent_ppo": (NAME, TINY.algorithm),
         "dqn": (NAME, {"learning_starts": 4, "train_freq": 4}),
         "sac": (CURRENTS, {"learning_starts": 4, "batch_size": 4})}
 
@@ -116,18 +115,9 @@ def test_an_agent_acts_as_it_was_evaluated(run):
     other = {"instrument": {"current_norm": None if env == CURRENTS else "L1"}}
     assert not agent.suits(Rules(PIPE_2D.with_changes(other)))
     if algo == "ppo":
-        chosen = [injected_currents(agent, env, kwargs, estimator) for estimator in ("reduced", "full")]
+        envs = (gym.make(env, estimator=estimator, observation="raw", **kwargs) for estimator in ("reduced", "full"))
+        chosen = [[seen["currents"] for _, seen, *_ in iter_injections(each.unwrapped, agent, 7)] for each in envs]
         np.testing.assert_array_equal(*chosen)
-
-
-def injected_currents(agent, env, kwargs, estimator):
-    world = gym.make(env, estimator=estimator, observation="raw", **kwargs).unwrapped
-    policy, ended, currents = agent.make(world.rules, np.random.default_rng(0)), False, []
-    observation, _ = world.reset(seed=7)
-    while not ended:
-        observation, _, ended, _, _ = world.step(policy.act(observation))
-        currents.append(observation["currents"])
-    return currents
 
 
 def test_a_killed_run_loses_no_more_than_an_interval(tmp_path, monkeypatch):
@@ -260,8 +250,7 @@ def test_the_command_prints_the_score_and_the_next_command(monkeypatch, tmp_path
     """The score is the mean error in the dev episodes of the last evaluation."""
     shorten(monkeypatch, NAME)
     config = tmp_path / "config.yml"
-    config.write_text("total_steps: 16\nn_envs: 2\ninterval: 16\nevaluation_episodes: 2\nepisodes: 2\nhidden: [8]\n"
-                      "algorithm: {n_steps: 8, batch_size: 8}\n")
+    config.write_text(json.dumps(asdict(replace(TINY, total_steps=16))))             # JSON is YAML
     code, said, complaint = eitbench("train", "--env", NAME, "--config", config, "--out", tmp_path / "run")
     assert code == 0, complaint
     errors = np.load(tmp_path / "run" / "evaluations.npz")["errors"][-1]
