@@ -70,8 +70,7 @@ def test_innovations_of_their_own_covariance_average_one():
 
 
 def test_crps_is_the_integral_of_its_definition():
-    """∫ (Φ((s − mean)/std) − 1[s ≥ truth])² ds by quadrature on either side of the truth; mean over time, weighted over
-    space."""
+    """∫ (Φ((s − mean)/std) − 1[s ≥ truth])² ds by quadrature; mean over time, weighted over space."""
     mean, std = np.array([[0.0, 1.0], [-3.0, 2.0]]), np.array([[1.0, 0.5], [2.0, 0.3]])
     truth, weights = np.array([[0.0, 2.2], [-9.0, 1.9]]), np.array([1.0, 3.0])
     below, above = np.empty((2, 2)), np.empty((2, 2))

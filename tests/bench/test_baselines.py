@@ -67,8 +67,7 @@ def test_unknown_baselines(tmp_path):
     ('"""My filter. Quick."""', "My filter"), ('"""\nMy filter\n\nLong story.\n"""', "My filter"), ("", "mine"),
     ('"""  """', "mine"), (f'"""{150 * "x"}"""', 120 * "x")])
 def test_titles(docstring, title, tmp_path):
-    """The title ends at the first colon, or with the first sentence or paragraph; without a docstring it is the file's
-    name."""
+    """The title ends at the first colon, sentence or paragraph; by default it is the file's name."""
     path = tmp_path / "mine.py"
     path.write_text(docstring + "\nclass Estimator:\n    def update(self, V, I): pass\n")
     assert load_method(str(path), "estimation").title == title

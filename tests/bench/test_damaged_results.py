@@ -40,11 +40,14 @@ def played(two_methods, monkeypatch, tmp_path):
     ("finished", None), ("scores", None), ("scores", {"error": "x"}), ("step_errors", 7), ("step_errors", ["a"]),
     ("environment", "Pipe2D"), ("environment", {"id": 5, "name": "a", "kwargs": {}}), ("run", {}), ("run", None),
     ("method", ["mine"]), ("seed", 7), ("version", None), ("scores", {"error": 10**400}),
-    ("scores", {"error": 0.1, "seconds_per_step": -1.0}), *((None, text) for text in ("", "{", "[]", "{}", "3"))])
+    ("scores", {"error": 0.1, "seconds_per_step": -1.0}),
+    *((None, text) for text in ("", "{", "[]", "{}", "3", None))])
 def test_a_damaged_result_is_reported_and_the_others_are_kept(field, value, played):
-    """Any value in place of a text, a number, an object or the whole file is handled."""
+    """Any value in place of a text, a number, an object or the whole file is handled, and a folder."""
     path = played / "dev-0.json"
-    path.write_text(json.dumps(json.loads(path.read_text()) | {field: value}) if field else value)
+    content = json.dumps(json.loads(path.read_text()) | {field: value}) if field else value
+    path.unlink()
+    path.mkdir() if content is None else path.write_text(content)
     with pytest.warns(UserWarning, match=r"mine/dev-0\.json is left out: it (cannot be read|is not (an ep|valid))"):
         records = EpisodeStore(played.parents[2]).write_records()
         assert not EpisodeStore(played.parents[2]).has_result("eitbench-Pipe2D-v0", "mine", 100_000, "any")
@@ -76,10 +79,3 @@ def test_estimates_of_another_shape_are_not_drawn(fields, played):
     with pytest.warns(UserWarning, match="no pictures of dev:0"):
         code, said, complaint = eitbench("leaderboard")
     assert code == 0 and "| mine" in said, complaint
-
-
-def test_results_that_are_not_files_are_reported(played):
-    """A folder in place of a result is ignored."""
-    (played / "dev-7.json").mkdir()
-    with pytest.warns(UserWarning, match=r"dev-7\.json is left out"):
-        assert len(list(EpisodeStore(played.parents[2]).results())) == 4

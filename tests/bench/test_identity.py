@@ -8,8 +8,7 @@ from importlib.metadata import EntryPoint
 
 import pytest
 from eitbench.bench import methods, run, tracks
-from eitbench.bench.run import Job, run_jobs
-from eitbench.bench.store import EpisodeStore
+from eitbench.bench.run import Job
 from eitbench.bench.tracks import Environment
 from eitbench.data.cache import CACHE_VARIABLE
 from eitbench.worlds import entry, register, registry
@@ -52,24 +51,9 @@ def apart(run_cache, monkeypatch):
     register_apart(monkeypatch)
 
 
-def test_an_edited_world_of_a_script_is_run_again(tmp_path):
-    """Another instrument, prior or task under the same id gives another identity; an equal configuration does not."""
-    log = tmp_path / "log"
-    path = write_baseline(tmp_path, init=counting(log))
-    register(TINY, ID)
-    mine = entry(ID)
-    store = EpisodeStore(tmp_path / "results")
-    noisy = TINY.with_changes({"instrument": {"noise_relative": 0.02}})
-    sure = TINY.with_changes({"prior": {"inflow_std": 0.5}})
-    for n, (world, settings) in enumerate([(TINY, {}), (noisy, {}), (sure, {}), (sure, {"lag": 1})], 1):
-        registry.import_entries([replace(mine, world=world, settings=settings)])
-        for _ in range(2):
-            run_jobs([Job(Environment(ID), path, 1)], store)
-        assert count(log) == n
-
-
 def test_another_task_has_another_identity(tmp_path):
-    """Another subtrack, world, seed or method's file gives another identity; a world is identified by its numbers."""
+    """Another subtrack, world, seed or method's file gives another identity, and so has another
+    instrument, prior or task under the same id; a world is identified by its numbers."""
     path, other = write_baseline(tmp_path), write_baseline(tmp_path, "other", doc="Other.")
     jobs = [Job(FILTER, path, 1), Job(FIXED_LAG, path, 1), Job(Environment(FILTER.id), path, 1), Job(FILTER, path, 2),
             Job(FILTER, other, 1)]
@@ -77,6 +61,14 @@ def test_another_task_has_another_identity(tmp_path):
     assert len({job.identity() for job in jobs}) == 5
     registry.import_entries([replace(entry(FILTER.id), world=replace(entry(FILTER.id).world))])
     assert Job(FILTER, path, 1).identity() == first
+    register(TINY, ID)
+    noisy = TINY.with_changes({"instrument": {"noise_relative": 0.02}})
+    sure = TINY.with_changes({"prior": {"inflow_std": 0.5}})
+    found = set()
+    for world, settings in [(TINY, {}), (noisy, {}), (sure, {}), (sure, {"lag": 1})]:
+        registry.import_entries([replace(entry(ID), world=world, settings=settings)])
+        found.add(Job(Environment(ID), path, 1).identity())
+    assert len(found) == 4
 
 
 def injection_identity(name="random_pair", **given):

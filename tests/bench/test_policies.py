@@ -161,8 +161,7 @@ def test_slug_triggered_follows_a_slug_and_rests_after_it():
 @pytest.mark.parametrize("name", [CURRENTS, BUDGET, FLOW, TANK])
 @pytest.mark.parametrize("policy", builtin_methods("injection"))
 def test_policies_run_in_compatible_environments(policy, name, monkeypatch):
-    """Actions are valid and within the budget; incompatible environments are rejected. (Golden files have the others.)
-    """
+    """Actions are valid and within the budget; incompatible environments are rejected."""
     env = environment(name)
     if not load_method(policy, "injection").suits(env.rules):
         with pytest.raises(ValueError, match=f"policy {policy} does not suit {name}"):

@@ -87,8 +87,7 @@ def test_an_error_affects_only_its_estimator(store, tmp_path, good):
 
 
 def test_only_scored_states_need_a_variance(tmp_path):
-    """Only scored states need a variance: one missing in the warm-up is ignored, one missing later removes all
-    scores."""
+    """A variance missing in the warm-up is ignored, one missing later removes the scores that need it."""
     late = "return Estimate(self.level, None if self.calls <= {} else 0 * self.level + 4.0)"
     (claimed, fields), (unclaimed, _) = (
         run_episode(Job(FILTER, write_baseline(tmp_path, update=late.format(first)), 1)) for first in (2, 3))
@@ -133,8 +132,7 @@ BIASED = Environment("eitbench/Pipe2DSmoothing-v0", json.dumps({"world": FAST, "
 
 
 def test_oracle_with_the_true_model():
-    """For any lag and assumption of the task, the oracle equals the smoother of the most probable inflow with
-    the true velocity."""
+    """For any lag and assumption, the oracle equals the inflow smoother with the true velocity."""
     smoother, _ = run_episode(Job(SMOOTHING, "inflow_smoother", 3))
     for environment in (FIXED_LAG, BIASED):
         reference, _ = run_episode(Job(environment, "true_model_smoother", 3))

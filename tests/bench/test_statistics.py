@@ -107,8 +107,7 @@ def test_paired_difference_of_interquartile_means():
 
 @pytest.mark.parametrize("statistic", [mean_over_environments, interquartile_mean])
 def test_exchanged_methods_have_the_negative_difference(statistic):
-    """The result is equal to the last bit if the methods are exchanged and the sign is changed, in any order of
-    environments and seeds."""
+    """The sign changes to the last bit, in any order of environments and seeds."""
     a, b = two_methods()
     value, low, high = paired_difference(a, b, statistic=statistic)
     random = np.random.default_rng(0)

@@ -173,8 +173,7 @@ def test_a_command_has_no_folder_of_the_machine(typed, kept):
 
 
 def test_other_results_fill_what_is_missing_or_failed(store):
-    """Successful results of the store are kept; results of other code complete them, results of other versions do
-    not."""
+    """Successful results are kept; results of other code, but not of other versions, complete them."""
     store.put(result(1, seconds=2.0), {})
     store.put(failed(2), {})
     others = [result(1, seconds=9.0), result(2, seconds=3.0),

@@ -113,8 +113,7 @@ def test_official_needs_a_clean_commit(tmp_path, monkeypatch):
 
 
 def test_official_and_longer_records_are_not_replaced(tmp_path, monkeypatch):
-    """Unofficial records and records with fewer episodes are rejected, for any commit; a newer version has a separate
-    record."""
+    """Unofficial and shorter records are rejected; a newer version has a separate record."""
     to = tmp_path / "to"
 
     def submitted(results, seeds, **how):

@@ -114,17 +114,6 @@ def test_a_valid_record_agrees():
     assert list(table["episode"]) != re.findall(r"test:\d", said)
 
 
-@confined
-def test_a_third_party_file_runs_under_bubblewrap(mine, own):
-    """The file is found by its sha256 in the folder methods, as in a pull request."""
-    place = Path("board/methods/somebody")
-    place.mkdir(parents=True)
-    shutil.copy(mine, place / "mine.py")
-    Path(mine).unlink()
-    code, said, complaint = eitbench("verify", own, "-j", 1)
-    assert code == 0 and "| bubblewrap" in said and AGREE in said, complaint
-
-
 def test_privileged_policies_and_failures_are_verified(tmp_path):
     """Built-in methods are known by name, and run with the arguments of the record; a failure agrees with a failure."""
     assert eitbench("run", "--env", INJECTION, "--policy", "clairvoyant", *REDUCED)[0] == 0
@@ -144,14 +133,14 @@ def failed(record):
     episode |= {"status": "failed", "message": "RuntimeError: oh", "where": "mine.py:1"}
 
 
-def test_changed_records_are_found(mine, own):
-    """The digest matches the changed content. The file of each record is found in the folder next to it."""
+def test_changed_records_are_found(own):
+    """The digest matches the changed content. The file of each record is found by its sha256 in the
+    folder methods next to it, as in a pull request."""
     changes = {"better": better, "failed": failed, "title": lambda record: record.update(title="Theirs"),
                "almost": lambda record: better(record, 1.0 + 1e-4)}
     paths = {name: changed(own, change, f"{name}/results") for name, change in changes.items()}
     for name in changes:
-        Path(name, "methods").mkdir()
-        shutil.copy(mine, Path(name, "methods"))
+        write_mine(Path(name, "methods", "somebody"))
     code, _, complaint = eitbench("verify", *paths.values(), *HERE, "--out", "again")
     assert code == 1 and complaint.count("differs: ") == 4
     for message in (r"test:0: \w+ differs by 0\.1 ", "status is ok", r"differs by 0\.0001 ",

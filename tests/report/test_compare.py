@@ -21,7 +21,7 @@ from tables import boards, said
 from tiny import record, sha
 
 TANK = "eitbench/RotatingTank2D-v0"
-PIPE_NAME, TANK_NAME = "eitbench/Pipe2D-v0", TANK
+PIPE = "eitbench/Pipe2D-v0"
 
 
 def two_methods():
@@ -42,16 +42,16 @@ def test_numbers_are_those_of_the_statistics():
     """Each environment has differences, fractions and their intervals."""
     a, b = two_methods()
     table = compare(a, b).set_index("environment")
-    assert list(table.index) == [PIPE_NAME, TANK_NAME] and list(table["episodes"]) == [12, 12]
+    assert list(table.index) == [PIPE, TANK] and list(table["episodes"]) == [12, 12]
     x, y = errors_of(a), errors_of(b)
-    for name in (PIPE_NAME, TANK_NAME):
+    for name in (PIPE, TANK):
         own, other = ({name: scores[name]} for scores in (x, y))
         assert tuple(table.loc[name, ["advantage", "low", "high"]]) == paired_difference(other, own)
         assert tuple(table.loc[name, ["better", "better_low", "better_high"]]) == (
             paired_probability_of_improvement(own, other))
         assert table["a"][name] == pytest.approx(np.mean(list(x[name].values())))
         assert table["b"][name] - table["a"][name] == pytest.approx(table["advantage"][name])
-    assert table["low"][TANK_NAME] > 0 < table["better_low"][TANK_NAME]
+    assert table["low"][TANK] > 0 < table["better_low"][TANK]
     swapped = compare(b, a).set_index("environment")
     np.testing.assert_allclose(swapped["advantage"], -table["advantage"])
     np.testing.assert_allclose(swapped["better"], 1 - table["better"])
@@ -79,7 +79,7 @@ def test_over_environments_gains_are_compared():
              record(name, (other * 2.0 * noise).tolist(), id=TANK, official=True)]
             for name, scale, other in (("a", 0.25, 0.52), ("b", 0.5, 0.5)))
     table = compare(a, b, zero=floor)
-    assert list(table["environment"]) == [PIPE_NAME, TANK_NAME, "all filter (2 environments)"]
+    assert list(table["environment"]) == [PIPE, TANK, "all filter (2 environments)"]
     assert list(table["score"]) == ["error", "error", "skill score"] and table["episodes"][2] == 24
     one, other = ({name: {seed: 1 - error / scale for seed, error in errors.items()}
                    for (name, errors), scale in zip(errors_of(side).items(), (0.02, 2.0), strict=True)}
@@ -91,8 +91,8 @@ def test_over_environments_gains_are_compared():
     assert (table["a"][2], table["b"][2]) == pytest.approx((gains["a"], gains["b"]), rel=1e-12)
     text = said(comparison_table(table))
     assert list(text["better"]) == ["A", "B", "A"] and text["ẽ_c of A"][2].startswith("skill score 0.")
-    assert list(compare(a, b)["environment"]) == [PIPE_NAME, TANK_NAME]
-    assert list(compare(a, b, "seconds_per_step", floor)["environment"]) == [PIPE_NAME, TANK_NAME, "all"]
+    assert list(compare(a, b)["environment"]) == [PIPE, TANK]
+    assert list(compare(a, b, "seconds_per_step", floor)["environment"]) == [PIPE, TANK, "all"]
 
 
 def test_only_shared_episodes_count():
@@ -103,7 +103,7 @@ def test_only_shared_episodes_count():
     assert (row["episodes"], row["a"], row["b"], row["better"]) == (1, 0.1, 0.4, 1.0)
     dev = [record(name, {"dev:0": error}) for name, error in (("a", 0.2), ("b", 0.1))]
     table = compare([*a, dev[0]], [dev[1], *b])
-    assert list(table["environment"]) == [f"{PIPE_NAME} (dev seeds)", PIPE_NAME]
+    assert list(table["environment"]) == [f"{PIPE} (dev seeds)", PIPE]
     assert row["advantage"] == pytest.approx(0.3) and (row["low"], row["high"]) == (-math.inf, math.inf)
 
 
@@ -177,4 +177,4 @@ def test_lines_are_not_wrapped_in_a_terminal():
     rows = narrow.split("\n\n")[1].splitlines()
     assert max(map(len, rows)) <= 60
     assert [cell.strip() for cell in rows[0].split("|")] == ["", "environment", "better", "advantage of A", ""]
-    assert rows[3].split()[:4] == ["|", TANK_NAME.removeprefix("eitbench/"), "|", "A"]
+    assert rows[3].split()[:4] == ["|", TANK.removeprefix("eitbench/"), "|", "A"]

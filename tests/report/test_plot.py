@@ -92,8 +92,7 @@ def test_an_episode_of_a_policy():
 
 
 def test_methods_are_compared_best_first():
-    """Each episode has a dot, the mean an interval; from one table or several; scores that are better when higher
-    are too."""
+    """Each episode has a dot, the mean an interval; one table and several give the same."""
     tables = [pd.DataFrame({"environment": "a", "method": method, "seed": ["dev:0", "dev:1"], "error": errors,
                             "seconds_per_step": [0.002, 0.004]})
               for method, errors in (("worse", [0.3, 0.5]), ("better", [0.1, 0.2]))]

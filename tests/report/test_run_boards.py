@@ -98,8 +98,7 @@ def test_skill_needs_its_anchors():
 
 @pytest.mark.parametrize("official", [True, False])
 def test_anchors_look_back_on_the_longest_made(official):
-    """The anchors are from the smoothing subtrack, also if other subtracks have them; of several versions the
-    official one counts, in any order."""
+    """Anchors of the smoothing subtrack have priority, and official ones of several versions."""
     others = [made("homogeneous", "filter", [0.5] * 3), made("true_model_smoother", "filter", [0.4] * 3)]
     mine = made("mine", "filter", REFERENCE)
     assert row([*others, *ANCHORS, mine], "mine", "filter")["skill"] == pytest.approx(1.0)

@@ -77,10 +77,8 @@ def constant(env, name, seed):
 
 @pytest.fixture(autouse=True)
 def tiny_worlds(monkeypatch, run_cache):
-    """Make the environment of each figure small.
-
-    The tests use a separate cache, since the flow past the bulge has another mesh here.
-    """
+    """Make the environment of each figure small, in a separate cache, since the flow past the bulge
+    has another mesh here."""
     monkeypatch.setenv(CACHE_VARIABLE, "{}-bulge-{}x{}".format(run_cache, *BULGE))
     monkeypatch.setattr(pipe2d, "_env", lambda lag=0, mean_velocity=None: make_environment("Pipe2D", PIPE, lag=lag))
     monkeypatch.setattr(velocity, "_env", lambda flow: make_environment(f"Pipe2D{KINDS[flow]}Velocity", FLOW))
@@ -90,9 +88,8 @@ def tiny_worlds(monkeypatch, run_cache):
     for name, id, steps in (("_stirred", "RotatingTank2D", 24), ("_at_rest", "StationaryTank2D", 16)):
         env = make_environment(id, {"schedule": {"scored_steps": steps}})
         monkeypatch.setattr(tanks, name, lambda env=env: env)
-    monkeypatch.setattr(profiles, "_error", lambda lag, baseline, profile,
-                        seeds: np.full(len(seeds), 0.02 if (
-        baseline == "homogeneous") else 0.004 if profile == "parabolic" else 0.006))
+    monkeypatch.setattr(profiles, "_error", lambda lag, baseline, profile, seeds: np.full(
+        len(seeds), 0.02 if baseline == "homogeneous" else 0.004 if profile == "parabolic" else 0.006))
     monkeypatch.setattr(parameters, "_error", lambda factors, _: 0.005 * (
         1.0 + 0.1 * abs(np.log2(factors.inflow_std)) + 0.01 * np.log2(factors.diffusivity)**2))
     velocity.run_joint_filter.cache_clear()
@@ -184,14 +181,12 @@ def test_injection_is_drawn(monkeypatch, run_cache, tmp_path):
 
     def rows(jobs, results):
         names = [job.load().name for job in {job.method: job for job in jobs}.values()]
-        return pd.DataFrame([{"policy": name, "seed": f"dev:{k}",
-                              "error": 0.01 * (1 + rank) + 0.001 * k, "spent": 5,
-                              "seconds_per_step": 0.001} for rank, name in enumerate(names)
-                              for k in range(3)])
+        return pd.DataFrame([{
+            "policy": name, "seed": f"dev:{k}", "error": 0.01 * (1 + rank) + 0.001 * k, "spent": 5,
+            "seconds_per_step": 0.001} for rank, name in enumerate(names) for k in range(3)])
 
     monkeypatch.setattr(injection, "run_jobs", lambda jobs, *_, **__: run_seeds.update({
-        jobs[0].environment: seed_ranges(list(dict.fromkeys(format_seed(job.seed)
-                                                            for job in jobs)))}))
+        jobs[0].environment: seed_ranges(sorted({format_seed(job.seed) for job in jobs}))}))
     monkeypatch.setattr(injection, "policy_rows", rows)
     monkeypatch.setattr(injection, "folder_results", lambda folder: [])
     shorten(monkeypatch, injection.ANIMATED[0])

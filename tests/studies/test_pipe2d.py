@@ -60,8 +60,7 @@ def test_order_of_the_methods(errors_of):
 
 
 def test_stationary_method_works_on_a_stationary_target():
-    """Gauss–Newton with the same α has at most a third of the homogeneous error if the target is stationary: three
-    states of an episode."""
+    """Gauss–Newton has at most a third of the homogeneous error in three stationary states."""
     task = make_task(PIPE_2D)
     interpolation, mass = score_operators(PIPE_2D)
     penalty = load_method("gauss_newton", "estimation").parameters["alpha"]**2 * stiffness_matrix(task.mesh)
