@@ -177,16 +177,13 @@ def test_policies_run_in_compatible_environments(policy, name, monkeypatch):
     assert 0.0 < played.errors.mean() < 1.0 and played.seconds_per_step >= 0.0
 
 
-def jobs_of(policies: list[str], seeds: str, **kwargs) -> list[Job]:
-    return [Job(Environment(NAME, json.dumps(SHORT | kwargs)), policy, seed)
-            for policy in policies for seed in parse_seeds(seeds)]
-
-
 def test_finished_and_failed_episodes_are_stored(tmp_path):
     """The record has the same format as for estimators; a failed episode has the reason, and no row."""
     store = EpisodeStore(tmp_path / "new")
     bad = write_policy(tmp_path, "return 0.5", "bad")
-    todo = jobs_of(["random_pair", "adjacent", bad], "dev:1,0", estimator="reduced")
+    reduced = Environment(NAME, json.dumps(SHORT | {"estimator": "reduced"}))
+    todo = [Job(reduced, policy, seed) for policy in ("random_pair", "adjacent", bad)
+            for seed in parse_seeds("dev:1,0")]
     run_jobs(todo, store, command="eitbench run")
     rows = policy_rows(todo, store.results())
     assert sorted(zip(rows["policy"], rows["seed"], strict=True)) == [

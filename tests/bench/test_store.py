@@ -18,7 +18,7 @@ from eitbench.data.cache import CACHE_VARIABLE
 from eitbench.data.seeds import format_seed
 
 from short import FAST
-from tiny import FILTER, RUN, git_says, sha, write_baseline
+from tiny import FILTER, RUN, git_says, record, sha, write_baseline
 
 ENV, COMMAND = "eitbench/Pipe2D-v0", "eitbench run --seeds train:1-2"
 
@@ -34,21 +34,10 @@ def store(tmp_path):
     return EpisodeStore(tmp_path / "results")
 
 
-def result(seed=1, method="mine", **changes):
-    """Return a result as `run_episode` does."""
-    return {"identity": "abc", "seed": format_seed(seed), "method": method, "title": "Mine", "parameters": {},
-            "role": None, "privileged": False, "method_sha256": sha("mine"), "version": sha("mine")[:8],
-            "checkpoint_sha256": None,
-            "board": "filter", "environment": {"id": ENV, "name": "eitbench-Pipe2D-v0", "kwargs": {}},
-            "finished": "2025-01-01T00:00:00+00:00", "status": "ok", "peak_memory": None,
-            "scores": {"error": 0.1, "seconds_per_step": 0.01}, "step_errors": [0.1], "seconds": 1.0,
-            "run": RUN} | changes
-
-
-def failed(seed):
-    """Return the result of a failed episode."""
-    made = {name: value for name, value in result(seed).items() if name not in ("scores", "step_errors")}
-    return made | {"status": "failed", "message": "broke", "where": "mine.py:1"}
+def result(seed=1, method="mine", error=0.1, **changes):
+    """Return a result as `run_episode` does; a failed one without an error."""
+    (made,) = record_results(record(method, {format_seed(seed): error}))
+    return made | changes
 
 
 @pytest.mark.parametrize("number", [math.nan, math.inf, -math.inf])
@@ -175,7 +164,7 @@ def test_a_command_has_no_folder_of_the_machine(typed, kept):
 def test_other_results_fill_what_is_missing_or_failed(store):
     """Successful results are kept; results of other code, but not of other versions, complete them."""
     store.put(result(1, seconds=2.0), {})
-    store.put(failed(2), {})
+    store.put(result(2, error=None), {})
     others = [result(1, seconds=9.0), result(2, seconds=3.0),
               result(3, seconds=4.0, run=RUN | {"source": sha("older")}, finished="2024-01-01T00:00:00+00:00"),
               result(4, version="v7", finished="2024-01-01T00:00:00+00:00")]

@@ -1,6 +1,7 @@
 """Submissions: test episodes are run, and records written, including failures, by the command `eitbench submit`."""
 
 import re
+from pathlib import Path
 
 import pytest
 from eitbench.bench import methods, run
@@ -16,6 +17,12 @@ from tiny import FILTER, SMOOTHING, count, counting, git_says, write_baseline
 
 INJECTION = "eitbench/Pipe2DInjection-v0"
 TEST = parse_seeds("test:0-1")
+
+
+def submitted(method, seeds, results, **how):
+    """Return the record in the folder ``to`` after a submission with results in a folder of this name."""
+    (path,) = submit(method, [FILTER.id], seeds, EpisodeStore(Path(results)), Path("to"), **how)
+    return read_record(path)
 
 
 @pytest.fixture(autouse=True)
@@ -97,64 +104,48 @@ def test_invalid_submissions(environments, seeds, message, tmp_path):
 
 def test_official_needs_a_clean_commit(tmp_path, monkeypatch):
     """The error is raised before any episode is run; after a commit the same call succeeds."""
-    to = tmp_path / "to"
-
-    def official():
-        provenance.cache_clear()
-        return list(submit("homogeneous", [FILTER.id], TEST[:1], EpisodeStore(tmp_path / "r"), to, official=True))
-
     for commit, message in (("c0ffee", "and changes to c0ffee"), (None, "outside a checkout")):
         with monkeypatch.context() as patch, pytest.raises(ValueError, match=f"official must be False .*{message}"):
             git_says(patch, commit, "M README.md")
-            official()
-        assert not (tmp_path / "r").exists() and not to.exists()
-    (path,) = official()
-    assert read_record(path)["official"]
+            submitted("homogeneous", TEST[:1], "r", official=True)
+        assert not list(tmp_path.iterdir())
+    provenance.cache_clear()
+    assert submitted("homogeneous", TEST[:1], "r", official=True)["official"]
 
 
 def test_official_and_longer_records_are_not_replaced(tmp_path, monkeypatch):
     """Unofficial and shorter records are rejected; a newer version has a separate record."""
     to = tmp_path / "to"
-
-    def submitted(results, seeds, **how):
-        (path,) = submit("homogeneous", [FILTER.id], seeds, EpisodeStore(tmp_path / results), to, **how)
-        return read_record(path)
-
-    first = submitted("a", TEST)
+    first = submitted("homogeneous", TEST, "a")
     with pytest.raises(ValueError, match=r"to must not hold a record with other episodes; .*homogeneous.* lose its "
                                          "episodes test:1$"):
-        submitted("b", TEST[:1], official=True)
+        submitted("homogeneous", TEST[:1], "b", official=True)
     assert read_records(to) == [first]
-    first = submitted("a", TEST, official=True)
+    first = submitted("homogeneous", TEST, "a", official=True)
     with pytest.raises(ValueError, match=r"to must not hold an official record; .* lose its official status$"):
-        submitted("c", TEST)
+        submitted("homogeneous", TEST, "c")
     assert read_records(to) == [first] and not (tmp_path / "c").exists()               # the error precedes all runs
     path = write_record(to, first | {"runs": [run | {"commit": "decaf"} for run in first["runs"]]})
     with pytest.raises(ValueError, match="would lose its official status"):
-        submitted("b", TEST[:1])
+        submitted("homogeneous", TEST[:1], "b")
     with monkeypatch.context() as patch:
         patch.setattr(methods, "golden_version", lambda name: 2)
-        assert submitted("b", TEST[:1])["seeds"] == ["test:0"]
+        assert submitted("homogeneous", TEST[:1], "b")["seeds"] == ["test:0"]
     newer = read_record(path.with_name(path.name.replace("v1", "v2")))
     assert split_outdated(read_records(to)) == ([read_record(path), newer], [])  # an official record stays current
 
 
 def test_a_record_is_extended(tmp_path):
     """Episodes run in another folder are added; episodes of the record are neither rerun nor lost."""
-    log, to = tmp_path / "log", tmp_path / "to"
+    log = tmp_path / "log"
     mine = write_baseline(tmp_path, init=counting(log))
-
-    def submitted(results, seeds):
-        (path,) = submit(mine, [FILTER.id], parse_seeds(seeds), EpisodeStore(tmp_path / results), to, isolate="none",
-                         command=f"submit {seeds}")
-        return read_record(path)
-
-    first = submitted("a", "test:10")
-    both = submitted("b", "test:9-10")
+    first = submitted(mine, parse_seeds("test:10"), "a", isolate="none", command="first")
+    both, again = (submitted(mine, parse_seeds("test:9-10"), results, isolate="none", command="both")
+                   for results in "bc")
     assert count(log) == 2 and both["seeds"] == ["test:9", "test:10"] and not both["official"]
-    assert [made["command"] for made in both["runs"]] == ["submit test:9-10", "submit test:10"]
+    assert [made["command"] for made in both["runs"]] == ["both", "first"]
     assert both["episodes"][1] == first["episodes"][0] | {"run": 1}
-    assert submitted("c", "test:9-10") == both and count(log) == 2
+    assert again == both
 
 
 def test_invalid_results_are_not_submitted(tmp_path, monkeypatch):

@@ -29,7 +29,6 @@ FIGURES = importlib.import_module("thesis").FIGURES
 common, injection, obstacle, parameters, pipe2d, profiles, tanks, velocity = (
     importlib.import_module(f"thesis.{name}") for name in
     ("common", "injection", "obstacle", "parameters", "pipe2d", "profiles", "tanks", "velocity"))
-episode_error, run_baseline = common.episode_error, common.run_baseline
 SEED = 100_000
 PIPE = merged(FAST, {"schedule": {"scored_steps": 32}})
 """A fast fluid crosses the pipe in two steps; pictures of the pipe show states up to the 28th."""
@@ -168,7 +167,7 @@ def test_map_estimate_minimises_its_objective():
         misfit = (V - task.observation.voltages(c, I)) / task.noise.std(V)
         return (misfit**2).sum() + (c - first.c_ref) @ precision @ (c - first.c_ref)
 
-    best, linear = (run_baseline(env, name, SEED)[2].mean for name in ("map_estimate", "kalman_filter"))
+    best, linear = (common.run_baseline(env, name, SEED)[2].mean for name in ("map_estimate", "kalman_filter"))
     assert objective(best) < objective(linear)
     for direction in (linear - best, first.mean - best):
         assert objective(best + 0.05 * direction) > 0.999 * objective(best)
