@@ -145,17 +145,6 @@ def test_arrays_must_be_a_pair_over_time_and_space(score, left, right):
         score(np.ones(left), np.ones(right))
 
 
-def test_ospa_of_one_body():
-    """A body is estimated 1, 50 and 3 mm off, then missed; of two absent ones the first is estimated to be
-    present: √((1 + 1600 + 9 + 1600 + 1600 + 0)/6) mm."""
-    truths = np.full((6, 1, 2), 0.1)
-    estimates = truths + 1e-3 * np.array([1.0, 50.0, 3.0, 2.0, 10.0, 100.0])[:, None, None] * [[[0.6, -0.8]]]
-    estimated = np.array([True, True, True, False, True, False])[:, None]
-    present = np.array([True, True, True, True, False, False])[:, None]
-    assert ospa(estimates, estimated, truths, present, 0.04) == pytest.approx(1e-3 * (4810 / 6)**0.5)
-    np.testing.assert_allclose(matched_distances(estimates, truths, present), [1e-3, 0.05, 3e-3, 2e-3], rtol=1e-9)
-
-
 def test_ospa_of_several_bodies_is_that_of_the_best_assignment():
     """All assignments of the definition: of two, three and four bodies, in any order, missed and false ones."""
     random = np.random.default_rng(0)
