@@ -1,13 +1,12 @@
 """Leaderboards of a user's results and their texts: statistics against scipy, rounding, scores, and order."""
 
 import math
-import re
 
 import numpy as np
 import pytest
 from eitbench.bench.text import format_interval, format_mean, format_number, mean_and_interval, seed_ranges
 from eitbench.report.boards import environment_title, run_leaderboards, world_key
-from eitbench.report.tables import markdown, run_table, terminal_tables
+from eitbench.report.tables import run_table, terminal_tables
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
@@ -49,22 +48,11 @@ def test_interval_is_students(values):
     (12.34, 3.0, "12 ± 3"), (123.4, 1.2, "123.4 ± 1.2"), (0.0096, 0.00096, "0.0096 ± 0.0010"),
     (0.0123, math.inf, "0.0123"), (2.0, 0.0, "2"), (0.0, 0.0, "0"), (0.0129, 0.02, "0.013 ± 0.020"),
     (0.0336, 0.2, "0.03 ± 0.20"), (0.0001, 0.2, "0.0 ± 0.2"),
+    (0.0012345, 1.2e-5, "0.00123 ± 0.00001"), (0.5, 4e-6, "0.5"), (1234.0, 50.0, "1234 ± 50"),
 ])
 def test_rounded_examples(mean, half, text):
     """One digit of the interval, two after a 1 or if the mean would have only one; equal decimals."""
     assert format_mean(mean, half) == text
-
-
-@given(st.floats(1e-3, 100.0), st.floats(1.01e-5, 1.0))
-def test_rounding_stays_within_the_interval(mean, part):
-    """The rounded mean is within the interval, which is accurate to a third; both have equal decimals."""
-    half = max(part * mean, 1.01e-5)
-    shown = format_mean(mean, half)
-    match = re.fullmatch(r"(\d+(?:\.(\d+))?) ± (\d+(?:\.(\d+))?)", shown)
-    assert match, shown
-    assert abs(float(match[1]) - mean) <= half / 2
-    assert abs(float(match[3]) - half) <= 0.34 * half
-    assert len(match[2] or "") == len(match[4] or "")
 
 
 @pytest.mark.parametrize(("value", "text"), [(0.01234, "0.012"), (1.234, "1.23"), (29.47, "29.5"), (999.4, "999"),
@@ -177,14 +165,6 @@ def test_terminal_tables_fit_and_name_what_is_left_out():
     assert "y" * 29 + "…" in table and lines[1].split("|")[2].endswith(":")
     uneven = terminal_tables(run_leaderboards([made("a", "filter", [0.1, 0.2]), made("b", "filter", [0.2])]), 200)
     assert "| test:0-1" in uneven and uneven.startswith("Pipe2D-v0, filter\n")
-
-
-def test_markdown_is_a_table():
-    """Every line has the same number of cells and the same width, for any title."""
-    odd = made("mine", "filter", [0.1, 0.2], title="mine | yours")
-    lines = markdown(run_leaderboards([odd, made("b", "filter", [0.2])])).splitlines()[2:]
-    assert len(lines) == 4 and re.fullmatch(r"[|:-]+", lines[1])
-    assert len({(len(line), len(re.findall(r"(?<!\\)\|", line))) for line in lines}) == 1
 
 
 def test_seeds_are_named_by_their_ranges():
