@@ -91,7 +91,11 @@ def test_a_sweep_has_a_table_and_a_chart(tmp_path):
     quiet, noisy = (float(cell.split("±")[0]) for cell in row.split("|")[2:4])
     assert quiet < noisy
     assert len(list((tmp_path / "results" / "episodes").iterdir())) == 2
-    assert "<h2>instrument.noise_relative</h2>" in (tmp_path / "results" / "index.html").read_text()
+    page = (tmp_path / "results" / "index.html").read_text(encoding="utf-8")
+    section = page.split("<h2>instrument.noise_relative</h2>")[1].split("</section>")[0]
+    assert re.findall(r">([^<>]+)</th>", section.replace("<wbr/>", "")) == ["method", "0.01", "0.3"]
+    (line,) = re.findall('<polyline class="series".*? points="([^"]*)"', section)
+    assert len(line.split()) == 2
     code, said, _ = run("--baseline", "homogeneous", "--set", "instrument.noise_relative=0.3")
     assert code == 0 and "Pipe2D-v0 (instrument.noise_relative=0.3), filter, dev:0-1\n" in said
 

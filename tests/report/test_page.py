@@ -16,13 +16,12 @@ from eitbench.data.cache import CACHE_VARIABLE
 from eitbench.numerics.round_meshes import extrude, uniform_disc
 from eitbench.report import charts, page
 from eitbench.report.boards import run_leaderboards
-from eitbench.report.sweep import sweeps
 from eitbench.worlds.catalogue import PIPE_3D
 from pages import Page, svgs
 from PIL import Image
 
 from short import short, shorten
-from tiny import FILTER, SMOOTHING, git_says, record, write_baseline
+from tiny import FILTER, SMOOTHING, git_says, write_baseline
 
 EVIL = "Evil <script>alert('x')</script> & \\\"co\\\""
 """A title with HTML; the page must escape it."""
@@ -101,20 +100,6 @@ def test_a_page_of_failures_or_without_estimates(made, tmp_path):
     assert "2 failed" in html and svgs(html) == [] and "RuntimeError: <b>&lt;" in " ".join(Page(html).text)
     html = page.write_page(EpisodeStore(tmp_path), run_leaderboards(records)).read_text(encoding="utf-8")
     assert len(svgs(html)) == 3 and "Snapshots" not in html
-
-
-def test_a_sweep_is_on_the_page(tmp_path):
-    """A table with a column for each value, and a chart with a line for each method."""
-    records = [record("a", [error], environment={"id": FILTER.id, "name": f"x{i}", "kwargs": {
-        "world": {"instrument": {"noise_relative": value}}}})
-        for i, (value, error) in enumerate([(0.3, 0.2), (0.01, 0.1)])]
-    found = sweeps(records, "instrument.noise_relative")
-    html = page.write_page(EpisodeStore(tmp_path), run_leaderboards(records), found).read_text(encoding="utf-8")
-    section = html.split("<h2>instrument.noise_relative</h2>")[1].split("</section>")[0]
-    cells = re.findall(r">([^<>]+)</t[hd]>", section.replace("<wbr/>", ""))
-    assert cells == ["method", "0.01", "0.3", "a", "0.1", "0.2"] and len(svgs(section)) == 1
-    (line,) = svgs(section)[0].findall("polyline[@class='series']")
-    assert len(line.get("points").split()) == 2
 
 
 def test_a_round_pipe_is_cut_along_its_axis():

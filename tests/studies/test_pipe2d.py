@@ -4,6 +4,7 @@ velocity. Scores on dev episodes are never reported.
 
 import importlib
 import sys
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -31,9 +32,12 @@ METHODS = {
 }
 
 
+published = cache(load)                      # reading all records takes seconds
+
+
 def published_errors(environment, baseline):
     """Return the errors of a method in the test episodes."""
-    table = load()
+    table = published()
     is_asked = (table["environment"] == environment) & (table["method"] == baseline) & (table["metric"] == "error")
     return table[is_asked & ~table["outdated"]].set_index("seed")["value"].sort_index().to_numpy()
 
