@@ -87,13 +87,14 @@ def test_a_sweep_has_a_table_and_a_chart(tmp_path):
     assert code == 0, complaint
     assert "ẽ_c for instrument.noise_relative =" in said
     head, _, row = (line for line in said.splitlines() if line.startswith("|"))
-    assert [cell.strip() for cell in head.split("|")[2:4]] == ["0.01", "0.3"]
-    quiet, noisy = (float(cell.split("±")[0]) for cell in row.split("|")[2:4])
+    cells = [cell.strip() for line in (head, row) for cell in line.split("|")[1:4]]
+    assert cells[:4] == ["method", "0.01", "0.3", "homogeneous"]
+    quiet, noisy = (float(cell.split("±")[0]) for cell in cells[4:])
     assert quiet < noisy
     assert len(list((tmp_path / "results" / "episodes").iterdir())) == 2
     page = (tmp_path / "results" / "index.html").read_text(encoding="utf-8")
     section = page.split("<h2>instrument.noise_relative</h2>")[1].split("</section>")[0]
-    assert re.findall(r">([^<>]+)</th>", section.replace("<wbr/>", "")) == ["method", "0.01", "0.3"]
+    assert re.findall(r">([^<>]+)</t[hd]>", section.replace("<wbr/>", "")) == cells
     (line,) = re.findall('<polyline class="series".*? points="([^"]*)"', section)
     assert len(line.split()) == 2
     code, said, _ = run("--baseline", "homogeneous", "--set", "instrument.noise_relative=0.3")
