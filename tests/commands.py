@@ -7,7 +7,7 @@ from typer.testing import CliRunner
 
 
 def run(*arguments):
-    """Return exit code, standard output and standard error; raise errors that a user would get as a traceback."""
+    """Return exit code, output and errors; raise what a user would get as a traceback."""
     done = CliRunner().invoke(app, list(map(str, arguments)))
     if done.exception is not None and not isinstance(done.exception, SystemExit):
         raise done.exception

@@ -4,7 +4,6 @@ import itertools
 
 import numpy as np
 import pytest
-import scipy.integrate
 from eitbench.numerics.fem import mass_matrix
 from eitbench.numerics.mesh import rectangle_mesh
 from eitbench.scoring import (
@@ -20,6 +19,7 @@ from eitbench.scoring import (
     step_errors,
     voltage_discrepancy,
 )
+from scipy.integrate import quad
 from scipy.stats import norm
 
 
@@ -70,14 +70,14 @@ def test_innovations_of_their_own_covariance_average_one():
 
 
 def test_crps_is_the_integral_of_its_definition():
-    """∫ (Φ((s − mean)/std) − 1[s ≥ truth])² ds by quadrature; mean over time, weighted over space."""
+    """∫ (Φ((s − mean)/std) − 1[s ≥ truth])² ds by quadrature; mean over time and weighted space."""
     mean, std = np.array([[0.0, 1.0], [-3.0, 2.0]]), np.array([[1.0, 0.5], [2.0, 0.3]])
     truth, weights = np.array([[0.0, 2.2], [-9.0, 1.9]]), np.array([1.0, 3.0])
     below, above = np.empty((2, 2)), np.empty((2, 2))
     for place in np.ndindex(2, 2):
         here = norm(mean[place], std[place])
-        below[place], _ = scipy.integrate.quad(lambda s, here=here: here.cdf(s)**2, -np.inf, truth[place])
-        above[place], _ = scipy.integrate.quad(lambda s, here=here: here.sf(s)**2, truth[place], np.inf)
+        below[place], _ = quad(lambda s, here=here: here.cdf(s)**2, -np.inf, truth[place])
+        above[place], _ = quad(lambda s, here=here: here.sf(s)**2, truth[place], np.inf)
     expected = (below + above).mean(axis=0) @ weights / 4
     assert crps(mean, std, truth, weights) == pytest.approx(expected, rel=1e-6)
 

@@ -67,14 +67,14 @@ def test_unknown_baselines(tmp_path):
     ('"""My filter. Quick."""', "My filter"), ('"""\nMy filter\n\nLong story.\n"""', "My filter"), ("", "mine"),
     ('"""  """', "mine"), (f'"""{150 * "x"}"""', 120 * "x")])
 def test_titles(docstring, title, tmp_path):
-    """The title ends at the first colon, sentence or paragraph; by default it is the file's name."""
+    """The title ends at a colon, sentence or paragraph; by default it is the file's name."""
     path = tmp_path / "mine.py"
     path.write_text(docstring + "\nclass Estimator:\n    def update(self, V, I): pass\n")
     assert load_method(str(path), "estimation").title == title
 
 
 def test_baselines_may_use_dataclasses(tmp_path):
-    """A file with deferred annotations and a dataclass can be loaded; its default subtrack is filter."""
+    """Deferred annotations and dataclasses are possible; the default subtrack is filter."""
     path = tmp_path / "mine.py"
     path.write_text("from __future__ import annotations\nfrom dataclasses import dataclass\n@dataclass\n"
                     "class Estimator:\n    task: object\n    def update(self, V, I): pass\n")

@@ -43,7 +43,7 @@ def played(two_methods, monkeypatch, tmp_path):
     ("scores", {"error": 0.1, "seconds_per_step": -1.0}),
     *((None, text) for text in ("", "{", "[]", "{}", "3", None))])
 def test_a_damaged_result_is_reported_and_the_others_are_kept(field, value, played):
-    """Any value in place of a text, a number, an object or the whole file is handled, and a folder."""
+    """Any value in place of a text, a number, an object or the file is handled, and a folder."""
     path = played / "dev-0.json"
     content = json.dumps(json.loads(path.read_text()) | {field: value}) if field else value
     path.unlink()

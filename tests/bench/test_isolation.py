@@ -69,18 +69,19 @@ def lasting(result):
 
 def write_fields(folder):
     """Write an estimator that reports every field."""
-    return write_baseline(
-        folder, parameters="{'a': [1, 2.5]}", update="self.level = self.level + voltages.sum() + 0.1 * self.calls; "
+    return write_baseline(folder, parameters="{'a': [1, 2.5]}", update=(
+        "self.level = self.level + voltages.sum() + 0.1 * self.calls; "
         "return Estimate(self.level, self.level**2, voltages, np.eye(4) + np.outer(voltages, voltages)) "
-        "if self.calls > self.task.lag else None")
+        "if self.calls > self.task.lag else None"))
 
 
 @pytest.mark.parametrize(("environment", "kind", "write"), [
-    (FIXED_LAG, "process", write_fields), (INJECTION, KIND, write_policy), (FILTER, KIND, lambda _: "homogeneous")],
-    ids=["lag", "injection", "built-in"])
+    (FIXED_LAG, "process", write_fields), (INJECTION, KIND, write_policy),
+    (FILTER, KIND, lambda _: "homogeneous")], ids=["lag", "injection", "built-in"])
 def test_scores_are_identical(environment, kind, write, tmp_path, monkeypatch):
-    """Test an estimator that reports every field, a policy that depends on its random numbers, and a built-in method by
-    name; one worker runs both episodes. The state of a policy's generator, which is sent, does not reveal the seed."""
+    """Test an estimator that reports every field, a policy that depends on its random numbers, and
+    a built-in method by name; one worker runs both episodes. The state of a policy's generator,
+    which is sent, does not reveal the seed."""
     sent = []
     encode = isolation.encode_message
     monkeypatch.setattr(isolation, "encode_message", lambda content: sent.append(content) or encode(content))
@@ -437,7 +438,8 @@ def test_malformed_messages_are_rejected(head, body):
         isolation.decode_message(content.read)
 
 
-@pytest.mark.parametrize("lengths", [(isolation.MAX_HEADER_BYTES + 1, 0), (0, isolation.MAX_ARRAY_BYTES + 1)])
+@pytest.mark.parametrize("lengths", [(isolation.MAX_HEADER_BYTES + 1, 0),
+                                     (0, isolation.MAX_ARRAY_BYTES + 1)])
 def test_long_messages_are_not_read(lengths):
     """Lengths are checked before anything else is read."""
     readable = iter([struct.pack("<QQ", *lengths)])

@@ -41,7 +41,7 @@ def data():
 
 @pytest.mark.parametrize("both_ways, many", [(False, 1), (True, 1), (False, 4), (True, 4)])
 def test_numpy_agrees_with_torch(study, both_ways, many):
-    """Corrections and variances agree for weights in half precision; joined networks return the mean."""
+    """Outputs agree for weights in half precision; joined networks return the mean."""
     torch.manual_seed(1)
     scales = 0.5 + torch.rand(7), 0.5 + torch.rand(3)
     networks = [study.Correction(*scales, 24, both_ways) for _ in range(many)]

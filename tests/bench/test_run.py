@@ -87,7 +87,7 @@ def test_an_error_affects_only_its_estimator(store, tmp_path, good):
 
 
 def test_only_scored_states_need_a_variance(tmp_path):
-    """A variance missing in the warm-up is ignored, one missing later removes the scores that need it."""
+    """A variance may be missing in the warm-up; one missing later removes its scores."""
     late = "return Estimate(self.level, None if self.calls <= {} else 0 * self.level + 4.0)"
     (claimed, fields), (unclaimed, _) = (
         run_episode(Job(FILTER, write_baseline(tmp_path, update=late.format(first)), 1)) for first in (2, 3))
@@ -140,15 +140,16 @@ def test_oracle_with_the_true_model():
         np.testing.assert_allclose(reference["step_errors"], smoother["step_errors"], rtol=1e-6)
 
 
-@pytest.mark.parametrize(("vessel", "method"), [({}, "joint_inflow_filter"), ({"half_width": 0.06}, "noser")],
-                         ids=["inflows", "states"])
+@pytest.mark.parametrize(("vessel", "method"), [
+    ({}, "joint_inflow_filter"), ({"half_width": 0.06}, "noser")], ids=["inflows", "states"])
 def test_oracle_in_a_changing_flow(vessel, method):
-    """Its error is smaller than a filter's with the first guess, or an image's, and it returns the true flow; also if
-    the inlet differs from the inlet of the fitted prior."""
+    """Its error is smaller than a filter's with the first guess, or an image's, and it returns the
+    true flow; also if the inlet differs from the inlet of the fitted prior."""
     changes = merged(FAST, {"schedule": {"scored_steps": 5}, "flow": {"velocity_range": [30.0, 60.0]},
                             "vessel": vessel})
     world = Environment("eitbench/Pipe2DTimeVaryingVelocity-v0", json.dumps({"world": changes}))
-    reference, guessing = (run_episode(Job(world, name, 3))[0]["scores"] for name in ("true_model_smoother", method))
+    reference, guessing = (run_episode(Job(world, name, 3))[0]["scores"]
+                           for name in ("true_model_smoother", method))
     assert reference["error"] < 0.9 * guessing["error"]
     assert reference["velocity_error"] < 1e-20 < guessing["velocity_error"]
     assert reference["solute_flow_error"] < 0.1 < guessing["solute_flow_error"]

@@ -89,8 +89,8 @@ def test_too_few_episodes_have_no_interval():
 
 
 def test_paired_difference_of_interquartile_means():
-    """It agrees, within Monte-Carlo error, with scipy's trimmed mean of the same resampled episodes of both methods, at
-    Student's percentiles for 41 episodes in three environments."""
+    """It agrees, within Monte-Carlo error, with scipy's trimmed mean of the same resampled episodes
+    of both methods, at Student's percentiles for 41 episodes in three environments."""
     a, b = two_methods()
     random = np.random.default_rng(6)
     drawn = [random.integers(len(own), size=(4000, len(own))) for own in a.values()]
@@ -204,7 +204,8 @@ def test_ranks_agree_with_the_definition(statistic, higher):
         for name in scores:
             others = [paired_difference(scores[name], scores[other], statistic=statistic, n_resamples=500)
                       for other in scores]
-            assert found[name] == 1 + sum(high < 0 if higher else low > 0 for _, low, high in others), seed
+            better = sum(high < 0 if higher else low > 0 for _, low, high in others)
+            assert found[name] == 1 + better, seed
         values = [statistic(*(list(own.values()) for own in scores[name].values())) for name in found]
         assert values == pytest.approx(sorted(values, reverse=higher), rel=1e-12)
 

@@ -162,7 +162,7 @@ def test_a_command_has_no_folder_of_the_machine(typed, kept):
 
 
 def test_other_results_fill_what_is_missing_or_failed(store):
-    """Successful results are kept; results of other code, but not of other versions, complete them."""
+    """Successful results are kept; others, except of other versions, complete them."""
     store.put(result(1, seconds=2.0), {})
     store.put(result(2, error=None), {})
     others = [result(1, seconds=9.0), result(2, seconds=3.0),

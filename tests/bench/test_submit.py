@@ -20,7 +20,7 @@ TEST = parse_seeds("test:0-1")
 
 
 def submitted(method, seeds, results, **how):
-    """Return the record in the folder ``to`` after a submission with results in a folder of this name."""
+    """Return the record in the folder ``to``, submitted with results in this folder."""
     (path,) = submit(method, [FILTER.id], seeds, EpisodeStore(Path(results)), Path("to"), **how)
     return read_record(path)
 
@@ -140,8 +140,8 @@ def test_a_record_is_extended(tmp_path):
     log = tmp_path / "log"
     mine = write_baseline(tmp_path, init=counting(log))
     first = submitted(mine, parse_seeds("test:10"), "a", isolate="none", command="first")
-    both, again = (submitted(mine, parse_seeds("test:9-10"), results, isolate="none", command="both")
-                   for results in "bc")
+    both, again = (submitted(mine, parse_seeds("test:9-10"), folder, isolate="none", command="both")
+                   for folder in "bc")
     assert count(log) == 2 and both["seeds"] == ["test:9", "test:10"] and not both["official"]
     assert [made["command"] for made in both["runs"]] == ["both", "first"]
     assert both["episodes"][1] == first["episodes"][0] | {"run": 1}
@@ -161,7 +161,7 @@ def test_invalid_results_are_not_submitted(tmp_path, monkeypatch):
 
 def test_from_a_file_to_the_leaderboards_by_command(tmp_path, monkeypatch):
     """The commands submit, leaderboard and compare work as README describes."""
-    monkeypatch.setattr(compare, "BUNDLED_RECORDS", tmp_path)              # reading all records takes seconds
+    monkeypatch.setattr(compare, "BUNDLED_RECORDS", tmp_path)      # all records take seconds
     write_baseline(tmp_path)
     common = ("--env", FILTER.id, "--seeds", "test:0-6", "-j", "1")
     code, said, complaint = eitbench("submit", "--baseline", "mine.py", *common)

@@ -110,8 +110,8 @@ def test_a_valid_record_agrees():
 
 
 def test_privileged_policies_and_failures_are_verified(tmp_path):
-    """Built-in methods are known by name, and run with the arguments of the record; a failure agrees
-    with a failure. Records that cannot be verified lead to exit status 1."""
+    """Built-in methods are known by name, and run with the arguments of the record; a failure
+    agrees with a failure. Records that cannot be verified lead to exit status 1."""
     assert eitbench("run", "--env", INJECTION, "--policy", "clairvoyant", *REDUCED)[0] == 0
     (path,) = tmp_path.glob("results/records/*--clairvoyant--*")
     code, said, complaint = eitbench("verify", path, "-j", 1)

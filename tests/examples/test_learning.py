@@ -1,4 +1,4 @@
-"""Examples in one file each, PPO and conservative Q-learning: formulas, learning in a bandit, a short environment."""
+"""PPO and conservative Q-learning in one file each: formulas, a bandit, a short environment."""
 
 import importlib.util
 from pathlib import Path
@@ -90,7 +90,8 @@ def test_values_follow_the_bellman_equation(monkeypatch):
     monkeypatch.setattr(offline, "AVERAGING", 0.2)
     data = bandit(200, 3) | {"reward": torch.ones(200), "last": torch.zeros(200)}
     values = offline.train(PAIRS, data, 400)(torch.eye(3))
-    torch.testing.assert_close(values, torch.full((3, 3), 1.0 / (1.0 - offline.GAMMA)), rtol=0.02, atol=0.0)
+    expected = torch.full((3, 3), 1.0 / (1.0 - offline.GAMMA))
+    torch.testing.assert_close(values, expected, rtol=0.02, atol=0.0)
 
 
 @pytest.mark.filterwarnings("ignore")

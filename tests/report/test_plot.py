@@ -85,8 +85,8 @@ def test_an_episode_of_a_policy():
     assert axes.shape == (1, 2) and "random_pair, ẽ_c =" in axes[0, 1].get_title()
     for method, seed, times, message in [
             ("homogeneous", 3, 6, "times must be an integer of at least 1 and at most 3, got 6"),
-            ("fixed_interval_smoother", 3, 1, "method fixed_interval_smoother for smoothing is not compatible"),
-            ("homogeneous", "dev:0-1", 1, "seed must name one episode, as in 'dev:0', got 'dev:0-1'")]:
+            ("fixed_interval_smoother", 3, 1, "method fixed_interval_smoother .* not compatible"),
+            ("homogeneous", "dev:0-1", 1, "seed must name one episode, .*, got 'dev:0-1'")]:
         with pytest.raises(ValueError, match=message):
             eitbench.plot.episode(method, PIPE, seed, world=world(PIPE)["world"], times=times)
 

@@ -57,8 +57,8 @@ def short_episodes(monkeypatch, tmp_path):
 
 def assert_submits(method, tmp_path):
     """A record of one test episode that finished."""
-    (path,) = submit(str(method), [NAME], parse_seeds("test:0"), EpisodeStore(tmp_path / "results"), tmp_path / "to",
-                     policy=True, isolate="none")
+    (path,) = submit(str(method), [NAME], parse_seeds("test:0"), EpisodeStore(tmp_path / "results"),
+                     tmp_path / "to", policy=True, isolate="none")
     record = read_record(path)
     assert [each["status"] for each in record["episodes"]] == ["ok"]
     return record
@@ -146,14 +146,15 @@ def test_a_policy_reads_the_files_that_its_class_names(policy, tmp_path):
 
 
 def test_a_method_is_its_file_and_the_files_it_names(policy, tmp_path):
-    """Other weights are another version of policies and estimators; a missing file, or one elsewhere, is named."""
+    """Other weights are another version; a file that is missing or lies elsewhere is named."""
     estimator = tmp_path / "network.py"
     estimator.write_text('class Estimator:\n    files = ("agent.pt",)\n    update = print\n')
     methods = ((str(policy), "injection"), (str(estimator), "estimation"))
     before = [load_method(*method).sha256 for method in methods]
     weights = torch.load(tmp_path / "agent.pt", weights_only=True)
     torch.save({name: 2 * value for name, value in weights.items()}, tmp_path / "agent.pt")
-    assert all(load_method(*method).sha256 != old for method, old in zip(methods, before, strict=True))
+    after = [load_method(*method).sha256 for method in methods]
+    assert all(one != other for one, other in zip(before, after, strict=True))
     for text, message in [('("agent.pt", "other.npz")', "files must name files in the folder of the method, got 'oth"),
                           ('("../agent.pt",)', "files must name files in the folder"),
                           ('"agent.pt"', "files must be a literal tuple of names")]:

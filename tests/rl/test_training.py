@@ -115,8 +115,10 @@ def test_an_agent_acts_as_it_was_evaluated(run):
     other = {"instrument": {"current_norm": None if env == CURRENTS else "L1"}}
     assert not agent.suits(Rules(PIPE_2D.with_changes(other)))
     if algo == "ppo":
-        envs = (gym.make(env, estimator=estimator, observation="raw", **kwargs) for estimator in ("reduced", "full"))
-        chosen = [[seen["currents"] for _, seen, *_ in iter_injections(each.unwrapped, agent, 7)] for each in envs]
+        envs = (gym.make(env, estimator=estimator, observation="raw", **kwargs).unwrapped
+                for estimator in ("reduced", "full"))
+        chosen = [[seen["currents"] for _, seen, *_ in iter_injections(each, agent, 7)]
+                  for each in envs]
         np.testing.assert_array_equal(*chosen)
 
 

@@ -88,7 +88,7 @@ def tiny_worlds(monkeypatch, run_cache):
         env = make_environment(id, {"schedule": {"scored_steps": steps}})
         monkeypatch.setattr(tanks, name, lambda env=env: env)
     monkeypatch.setattr(profiles, "_error", lambda lag, baseline, profile, seeds: np.full(
-        len(seeds), 0.02 if baseline == "homogeneous" else 0.004 if profile == "parabolic" else 0.006))
+        len(seeds), 0.02 if baseline == "homogeneous" else {"parabolic": 0.004}.get(profile, 6e-3)))
     monkeypatch.setattr(parameters, "_error", lambda factors, _: 0.005 * (
         1.0 + 0.1 * abs(np.log2(factors.inflow_std)) + 0.01 * np.log2(factors.diffusivity)**2))
     velocity.run_joint_filter.cache_clear()
@@ -167,7 +167,8 @@ def test_map_estimate_minimises_its_objective():
         misfit = (V - task.observation.voltages(c, I)) / task.noise.std(V)
         return (misfit**2).sum() + (c - first.c_ref) @ precision @ (c - first.c_ref)
 
-    best, linear = (common.run_baseline(env, name, SEED)[2].mean for name in ("map_estimate", "kalman_filter"))
+    best, linear = (common.run_baseline(env, name, SEED)[2].mean
+                    for name in ("map_estimate", "kalman_filter"))
     assert objective(best) < objective(linear)
     for direction in (linear - best, first.mean - best):
         assert objective(best + 0.05 * direction) > 0.999 * objective(best)
