@@ -31,8 +31,6 @@ def facet_sizes(mesh: Mesh) -> np.ndarray:
     return 0.5 * np.linalg.norm(np.cross(edge[:, 0], edge[:, 1]), axis=1)
 
 
-# -- cells and facets -------------------------------------------------------------------------------------------------
-
 @in_both_dimensions
 def test_volumes(dim):
     """The cells fill the box; volumes agree with the mass matrix."""
@@ -91,8 +89,6 @@ def test_stiffness_of_a_linear_function(dim):
     assert_allclose(u @ stiffness_matrix(mesh) @ u, g @ g * SIZE[:dim].prod(), rtol=1e-12)
 
 
-# -- interpolation ----------------------------------------------------------------------------------------------------
-
 @settings(max_examples=40)
 @given(dim=st.sampled_from([2, 3]), seed=st.integers(0, 2**32 - 1), candidates=st.sampled_from([1, 4, 32]),
        a=st.lists(st.floats(-100, 100), min_size=4, max_size=4))
@@ -133,8 +129,6 @@ def test_points_outside_are_located_at_the_nearest_wall(dim):
     for cell, weights in zip(mesh.cells[cells], barycentric, strict=True):
         assert any(weights[i] == 0 and tuple(np.sort(np.delete(cell, i))) in walls for i in range(dim + 1))
 
-
-# -- structured meshes ------------------------------------------------------------------------------------------------
 
 def test_rectangle_mesh_is_numbered_by_cross_section():
     """Nodes run up the first cross-section, then the next; matrices have half-bandwidth len(y) + 1."""
@@ -187,8 +181,6 @@ def test_graded_pipe_mesh():
     for i in place:
         assert size[i] < 0.3 * size[i + 2] and size[i - 1] < 0.3 * size[i - 3]
 
-
-# -- errors -----------------------------------------------------------------------------------------------------------
 
 @pytest.mark.parametrize(("points", "cells", "match"), [
     (TRIANGLE[:, :1], [[0, 1]], r"points must have shape \(n_nodes, 2\) or \(n_nodes, 3\)"),

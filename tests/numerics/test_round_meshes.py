@@ -51,31 +51,21 @@ SECTIONS = {"rings": disc_mesh(*random_rings(np.random.default_rng(0))), "unifor
 each_section = pytest.mark.parametrize("section", SECTIONS.values(), ids=SECTIONS.keys())
 
 
-# -- discs ------------------------------------------------------------------------------------------------------------
-
 @pytest.mark.parametrize("seed", range(20))
 def test_rings_are_joined_without_gap_or_overlap(seed):
-    """Triangles fill the outer polygon, meet edge to edge, and have the outer ring's edges as their only boundary."""
+    """Triangles fill the outer polygon, meet edge to edge, and have the outer ring's edges as their
+    only boundary. Node 0 is the centre, followed by the rings in the order of their angles."""
     radii, rings = random_rings(np.random.default_rng(seed))
     mesh = disc_mesh(radii, rings)
+    on_rings = [r * np.exp(1j * ring) for r, ring in zip(radii, rings, strict=True)]
+    assert_allclose(mesh.points @ [1, 1j], np.concatenate([[0.0], *on_rings]), atol=1e-15)
     n = len(rings[-1])
-    assert mesh.n_nodes == 1 + sum(map(len, rings))
     assert_allclose(mesh.volumes.sum(), polygon_area(mesh.points[-n:]), rtol=1e-13)
     edges, count = facet_counts(mesh)
     assert count.max() == 2
     assert mesh.n_nodes - len(edges) + len(mesh.cells) == 1                            # Euler: one piece, no hole
     wall = mesh.n_nodes - n + np.arange(n)
     assert_array_equal(mesh.boundary_facets, np.unique(np.sort([wall, np.roll(wall, -1)], axis=0).T, axis=0))
-
-
-def test_nodes_are_numbered_from_the_centre_outwards():
-    """Node 0 is the centre, followed by the rings in the order of their angles."""
-    radii, rings = random_rings(np.random.default_rng(1))
-    points = disc_mesh(radii, rings).points
-    assert_array_equal(points[0], 0.0)
-    assert_allclose(np.linalg.norm(points[1:], axis=1), np.repeat(radii, list(map(len, rings))))
-    assert_allclose(points[1:, 0] + 1j * points[1:, 1], np.concatenate(
-        [r * np.exp(1j * ring) for r, ring in zip(radii, rings, strict=True)]), atol=1e-15)
 
 
 @pytest.mark.parametrize("rings", [1, 4, 9])
@@ -106,8 +96,6 @@ def test_electrode_disc(spans, cells, rings, smallest):
     assert np.diff(radii).argmin() == rings - 1
     assert angles_of(mesh).min() > smallest
 
-
-# -- extruded bodies --------------------------------------------------------------------------------------------------
 
 @each_section
 def test_nodes_are_numbered_by_section(section):
@@ -171,8 +159,6 @@ def test_round_pipe_mesh():
     chords = 2 * R * np.sin(np.diff(graded_interval(*SPANS[2], 3, 2.0)) / 2)
     assert_allclose(area.sum(), 0.04 * chords.sum(), rtol=1e-10)
 
-
-# -- errors -----------------------------------------------------------------------------------------------------------
 
 SQUARE = np.pi / 2 * np.arange(4)
 
