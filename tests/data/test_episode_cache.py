@@ -106,18 +106,14 @@ def test_outline_knows_the_largest_voltage():
     assert scoring_constants(TINY).largest_voltage == pytest.approx(largest, rel=1e-10)
 
 
-def test_resistances_and_noise_are_those_of_the_episode(episode):
-    """Transfer resistances and noise are stored without rounding."""
+def test_resistances_noise_and_voltages_are_those_of_the_episode(episode):
+    """Transfer resistances and noise are stored without rounding. V = 𝓡I + std·n with std² = (1 %
+    of the measurement)² + (0.1 % of the largest)² and the currents of the cycle, which repeats."""
     entries = cached_episode(TINY, 7)
     assert entries.shape == (5,) and entries["moment"].shape == (5, 1701)
     for name in ("transfer_resistance", "noise"):
         mine, theirs = entries[name], getattr(episode, name)
         assert mine.dtype == theirs.dtype and mine.tobytes() == theirs.tobytes()
-
-
-def test_cycle_voltages_are_those_of_the_episode(episode, entries):
-    """V = 𝓡I + std·n with std² = (1 % of the measurement)² + (0.1 % of the largest)² and the currents of the cycle,
-    which repeats after each frame."""
     clean = np.einsum("tij,tj->ti", episode.transfer_resistance, TINY.currents[[0, 1, 0, 1, 0]])
     std = np.hypot(0.01 * clean, 0.001 * np.abs(clean).max(axis=1, keepdims=True))
     np.testing.assert_allclose(cycle_voltages(TINY, 7, entries), clean + std * episode.noise, rtol=1e-12)
