@@ -5,7 +5,6 @@ from dataclasses import replace
 from itertools import product
 from pathlib import Path
 
-import gymnasium as gym
 import numpy as np
 import pytest
 from eitbench.data.episode_cache import instrument_faults
@@ -181,9 +180,3 @@ def test_open_inputs_may_measure_zero() -> None:
     broken = core.faults.open_circuit_from <= core.t - 16
     assert core._filters.faults.probabilities[broken, BROKEN].min() > 0.99
     assert np.isfinite(errors[-1]).all()
-
-
-@pytest.mark.parametrize("id", ["eitbench/Pipe2DInjection-v0", "eitbench/TankTracking-v0"])
-def test_estimated_faults_require_an_instrument_with_faults(id: str) -> None:
-    with pytest.raises(ValueError, match="faults must be 'gate' for an instrument without faults"):
-        gym.make(id, faults="estimated")

@@ -28,12 +28,6 @@ def test_each_body_moves_by_itself():
     assert (double <= single).all() and (double < 0.5 * single).any()
 
 
-@pytest.mark.parametrize("n", [0, 5, 1.5])
-def test_the_number_of_bodies_is_bounded(n):
-    with pytest.raises(ValueError, match=f"n_bodies must be an integer of at least 1 and at most 4, got {n}"):
-        TWO.with_changes({"target": {"n_bodies": n}})
-
-
 @lru_cache(maxsize=1)
 def signals():
     """Return a filter of two bodies after a step, the injection's voltages, and the voltages of each particle."""

@@ -5,7 +5,7 @@ import pytest
 from eitbench.bench.runner import run_on_measurements
 from eitbench.envs.measured import MeasuredEnv
 from eitbench.estimation.walk import matern32_transition, matern_modes
-from tanks import FIXED_STDS, VESSEL, moving
+from tanks import VESSEL, moving
 
 
 def test_correlation_is_matern():
@@ -28,9 +28,8 @@ def test_process_noise_is_integrated_white_noise():
                                rtol=1e-6, atol=1e-9)
 
 
-def test_modes_reproduce_the_covariance_of_the_field():
+def test_modes_reproduce_the_covariance_of_the_field(env):
     """The residual is at most a thousandth of the variance of the strongest mode."""
-    env = MeasuredEnv(moving(frames=3), VESSEL, **FIXED_STDS)
     walk = env.task.transport
     modes = matern_modes(walk.mesh, walk.length)
     strongest = (modes**2).sum(axis=0).max()
@@ -39,9 +38,9 @@ def test_modes_reproduce_the_covariance_of_the_field():
     assert residual.max() <= 1.001e-3 * strongest
 
 
-def test_smooth_motion_predicts_better_than_a_random_walk():
+def test_smooth_motion_predicts_better_than_a_random_walk(coarse):
     """The withheld RMSE is at least a tenth smaller for an inclusion that moves half round a tank in 12 frames."""
     env = MeasuredEnv(moving(frames=12), VESSEL, withheld=0.15)
     random_walk, smooth_motion = (run_on_measurements(env, name).withheld_rmse
-                        for name in ("log_walk_filter", "log_steady_filter"))
+                                  for name in ("log_walk_filter", "log_steady_filter"))
     assert smooth_motion < 0.9 * random_walk

@@ -126,27 +126,6 @@ def test_a_kink_counts_half_from_either_side():
     np.testing.assert_allclose(derivative, 0.5 * (up + down), atol=1e-4 * scale)
 
 
-def test_derivatives_at_the_inlet_are_zero():
-    """The inflow is prescribed for any velocity; inlet values of c are ignored."""
-    cd, (c, before, after) = build(eddy), random_state(np.random.default_rng(6))
-    _, derivatives = cd.velocity_derivatives(c, before, after, [PARABOLA])
-    np.testing.assert_array_equal(derivatives[INLET], 0.0)
-    assert (derivatives[7:] != 0.0).all()
-    c[INLET] = 1e3
-    np.testing.assert_array_equal(cd.velocity_derivatives(c, before, after, [PARABOLA])[1], derivatives)
-
-
-def test_transition_is_that_of_the_evolution_model():
-    """F and Y are the same with and without H, in either order."""
-    first, second = build(eddy), build(eddy)
-    F, Y = first.transition()
-    for model in (first.evolution_model(), second.evolution_model()):
-        np.testing.assert_array_equal(model.F, F)
-        np.testing.assert_array_equal(model.Y, Y)
-    np.testing.assert_array_equal(second.transition()[0], F)
-    assert first.evolution_model().F is F
-
-
 @pytest.mark.parametrize(("changes", "name"), [
     ({"c": np.zeros(90)}, "^c "), ({"c": np.zeros((91, 2))}, "^c "),
     ({"c": np.full(91, np.nan)}, "^c "),
