@@ -64,7 +64,7 @@ def test_unstable_models_have_no_limit(radius):
 def test_open_loop_covariance_is_cached_for_a_flow_and_a_prior(tmp_path, monkeypatch):
     """A second process reads the same bits; another flow or prior has its own file."""
     def covariance(velocity=1.0, **prior):
-        _, held = nodal_states(coarse_transport([velocity], 1e-2), Prior(**prior), 1.0).initial()
+        _, held = nodal_states(coarse_transport([velocity]), Prior(**prior), 1.0).initial()
         return held.open_loop
 
     with use_cache_dir(tmp_path):

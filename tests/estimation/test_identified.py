@@ -24,7 +24,8 @@ from eitbench.estimation import (
 )
 from eitbench.worlds.catalogue import PIPE_2D
 from eitbench.worlds.task import make_task
-from models import by_window, two_modes
+from models import by_window
+from models import tiny_prior as prior
 from models import tiny_task as task
 
 from tiny_worlds import TINY
@@ -39,11 +40,6 @@ def examples(seeds):
 @lru_cache(maxsize=1)
 def model():
     return identify_model(examples("train:0-23"), modes=24)
-
-
-@lru_cache(maxsize=1)
-def prior():
-    return two_modes(task().mesh.points[task().transport.inlet], task().transport.time_step)
 
 
 def made(response, seed):

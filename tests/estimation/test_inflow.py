@@ -1,8 +1,6 @@
 """Inflow-window filters are compared with dense conditioning, the transport and finite differences; priors with the law
 of their samples."""
 
-from functools import lru_cache
-
 import numpy as np
 import pytest
 from eitbench.bench.methods import baseline_folder
@@ -24,19 +22,13 @@ from eitbench.worlds.catalogue import PIPE_2D_OBSTACLE
 from eitbench.worlds.catalogue import ROTATING_TANK_2D as ROTATING_TANK
 from eitbench.worlds.catalogue import STATIONARY_TANK_2D as STATIONARY_TANK
 from eitbench.worlds.task import make_task
+from models import tiny_prior as prior
 from models import tiny_task as task
-from models import two_modes
 from scipy.linalg import toeplitz
 
 from tiny_worlds import TINY
 
 LEVEL = 29.0
-
-
-@lru_cache(maxsize=2)
-def prior(link="logarithm"):
-    """Return a prior of two modes across the inlet, correlated over four steps."""
-    return two_modes(task().mesh.points[task().transport.inlet], task().transport.time_step, link)
 
 
 def record():
@@ -55,8 +47,10 @@ def some_inflows(space):
 
 
 def stepped(inflow, transports):
-    """Return the concentration after inflows (W, n_inlet), the oldest first, by the transport of each step."""
-    state, before = np.full(task().mesh.n_nodes, LEVEL), np.full(inflow.shape[1], LEVEL)
+    """Return the concentration after inflows (W, n_inlet), the oldest first, by the transport of
+    each step, from a pipe at `LEVEL`."""
+    state = np.full(transports[0].mesh.n_nodes, LEVEL)
+    before = np.full(inflow.shape[1], LEVEL)
     for after, transport in zip(inflow, transports, strict=True):
         state = transport.step(state, before, after)
         before = after
