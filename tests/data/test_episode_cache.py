@@ -7,7 +7,6 @@ import sys
 import gymnasium as gym
 import numpy as np
 import pytest
-import scipy.sparse as sp
 from eitbench.data import cache
 from eitbench.data.episode_cache import (
     EXTRA_STEPS,
@@ -89,14 +88,6 @@ def test_score_is_the_integral_over_the_truth(episode, entries, to_truth):
         for t in range(5):                             # one step at a time, as in environments
             one = step_error(mass, estimate[t] - TINY.background, *integrals(TINY, entries[t]))
             np.testing.assert_allclose(one, exact[t], **exactly)
-
-
-def test_outline_holds_one_triangle_of_the_mass_on_the_estimators_nodes(to_truth):
-    """xᵀ·mass·x = ∫(Px)² over the truth's triangles for any x, and nothing is stored below the diagonal."""
-    mass, mesh = scoring_constants(TINY).mass, truth_mesh(TINY)
-    assert mass.shape == (1701, 1701) and sp.tril(mass, -1).nnz == 0 and sp.triu(mass, 1).nnz > 1701
-    for x in np.random.default_rng(2).normal(size=(5, 1701)):
-        assert x @ (mass @ x) == pytest.approx(integral_of_square(mesh, to_truth @ x), rel=1e-12)
 
 
 def test_outline_knows_the_largest_voltage():

@@ -16,7 +16,7 @@ from eitbench.worlds.catalogue import PIPE_2D, PIPE_3D
 from eitbench.worlds.task import make_task
 from scipy.linalg import toeplitz
 
-WORLDS = {"2D": PIPE_2D, "3D": PIPE_3D.with_changes({"flow": {"mean_velocity": 18.0}})}
+WORLDS = {"2D": PIPE_2D, "3D": PIPE_3D.with_changes({"flow": {"mean_velocity": 36.0}})}
 """A faster flow in 3D has a shorter impulse response."""
 
 

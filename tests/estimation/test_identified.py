@@ -150,17 +150,6 @@ def test_filter_linearises_once_with_an_error_covariance():
     known = filter_.covariance.array[:by_x.shape[1], :by_x.shape[1]]
     variance = ((by_x @ known) * by_x).sum(axis=1) + ((LEVEL * once().root)**2).sum(axis=1)
     np.testing.assert_allclose(filter_.estimate().variance, variance, rtol=1e-9)
-    with pytest.raises(ValueError, match="model must have voltages that are linearised at each estimate"):
-        map_inflow(task(), prior(), LEVEL, [], model=once())
-
-
-def test_only_train_episodes_are_accepted():
-    with pytest.raises(ValueError, match=r"seeds must be of the split train.*dev:0"):
-        identify_model(examples("dev:0"))
-    with pytest.raises(ValueError, match="more states than modes, 24; got 5"):
-        identify_model(examples("train:0"), modes=24)
-    with pytest.raises(ValueError, match="at least 4 episodes with residual_only, got 3"):
-        identify_model(examples("train:0-2"), modes=4, residual_only=True)
 
 
 def surprise(space, before, covariance, x, voltages, currents):
@@ -218,15 +207,23 @@ def test_files_round_trip(tmp_path):
     assert not compatible_models(tmp_path, make_task(PIPE_2D))
 
 
-def test_invalid_files_are_rejected(tmp_path):
-    for content in (b"", b"PK", b"{}"):
-        (tmp_path / "b.npz").write_bytes(content)
-        with pytest.raises(ValueError, match=r"b\.npz must be a model of `eitbench fit model`"):
-            IdentifiedModel.load(tmp_path / "b.npz")
-    with pytest.raises(ValueError, match=r"residual_covariance must have shape \(24, 24\)"):
-        replace(model(), residual_covariance=np.eye(3))
-    with pytest.raises(ValueError, match=r"voltage_error_covariance must have shape"):
-        replace(model(), voltage_error_covariance=np.eye(4))
+@pytest.mark.parametrize(("call", "message"), [
+    (lambda: identify_model(examples("train:0"), modes=24), "more states than modes, 24; got 5"),
+    (lambda: identify_model(examples("train:0-2"), modes=4, residual_only=True),
+     "at least 4 episodes with residual_only, got 3"),
+    (lambda: map_inflow(task(), prior(), LEVEL, [], model=once()),
+     "model must have voltages that are linearised at each estimate"),
+    (lambda: replace(model(), residual_covariance=np.eye(3)),
+     r"residual_covariance must have shape \(24, 24\)"),
+    (lambda: replace(model(), voltage_error_covariance=np.eye(4)),
+     "voltage_error_covariance must have shape"),
+    *((content, r"b\.npz must be a model of `eitbench fit model`")
+      for content in (b"", b"PK", b"{}"))])
+def test_invalid_arguments_and_files_are_rejected(call, message, tmp_path):
+    if isinstance(call, bytes):
+        (tmp_path / "b.npz").write_bytes(call)
+    with pytest.raises(ValueError, match=message):
+        IdentifiedModel.load(tmp_path / "b.npz") if isinstance(call, bytes) else call()
 
 
 @lru_cache(maxsize=1)

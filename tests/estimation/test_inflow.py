@@ -6,21 +6,18 @@ import pytest
 from eitbench.bench.methods import baseline_folder
 from eitbench.data.episode_cache import cached_episode, cycle_voltages
 from eitbench.data.episodes import cached_truth_model, simulate
-from eitbench.data.seeds import parse_seeds
 from eitbench.estimation import (
     Filter,
     InflowPrior,
     InflowWindow,
     compatible_priors,
     fit_inflow_prior,
-    fit_prior_from_episodes,
     full_window_filter,
     maximise_posterior,
     time_varying_responses,
 )
 from eitbench.worlds.catalogue import PIPE_2D_OBSTACLE
 from eitbench.worlds.catalogue import ROTATING_TANK_2D as ROTATING_TANK
-from eitbench.worlds.catalogue import STATIONARY_TANK_2D as STATIONARY_TANK
 from eitbench.worlds.task import make_task
 from models import tiny_prior as prior
 from models import tiny_task as task
@@ -190,9 +187,6 @@ def test_inlets_are_compared_with_a_tolerance():
 
 
 @pytest.mark.parametrize(("call", "message"), [
-    (lambda: fit_prior_from_episodes(TINY, parse_seeds("dev:0-3")),
-     r"seeds must be of the split train.*dev:0"),
-    (lambda: fit_prior_from_episodes(STATIONARY_TANK, [0]), "target must have an inflow, got"),
     (lambda: InflowWindow(make_task(ROTATING_TANK), prior(), LEVEL),
      "the prior must be for the task's inlet, 0 nodes"),
     (lambda: InflowPrior("log", prior().points, prior().modes, prior().correlation, 0.005),
