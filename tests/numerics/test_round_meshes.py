@@ -98,25 +98,21 @@ def test_electrode_disc(spans, cells, rings, smallest):
 
 
 @each_section
-def test_nodes_are_numbered_by_section(section):
-    """The nodes at every z are the section's, in its order; a cell's nodes are in two neighbouring sections."""
-    body = extrude(section, Z)
-    points = body.points.reshape(len(Z), section.n_nodes, 3)
-    assert_array_equal(points[:, :, :2], np.broadcast_to(section.points, (len(Z), *section.points.shape)))
-    assert_array_equal(points[:, :, 2], np.broadcast_to(Z[:, None], points.shape[:2]))
-    layers = body.cells // section.n_nodes
-    assert_array_equal(np.ptp(layers, axis=1), 1)
-    within = body.cells % section.n_nodes                                              # each lies above one triangle
-    assert {tuple(np.unique(cell)) for cell in within} == {tuple(cell) for cell in np.sort(section.cells, axis=1)}
-
-
-@each_section
 def test_prisms_are_filled_and_neighbours_agree(section):
-    """Three tetrahedra of one volume a prism; every facet inside has two cells; outside are two ends and the sides."""
+    """The nodes at every z are the section's, in its order. Three tetrahedra of one volume fill a
+    prism, with nodes in two neighbouring sections; every facet inside has two cells; outside are
+    two ends and the
+    sides."""
     # Renumbered at random: the diagonals must fit together however the section is numbered.
     place = np.random.default_rng(2).permutation(section.n_nodes)
     section = Mesh(section.points[np.argsort(place)], place[section.cells])
     body = extrude(section, Z)
+    points = body.points.reshape(len(Z), section.n_nodes, 3)
+    assert_array_equal(points[:, :, :2], np.broadcast_to(section.points, (len(Z), *section.points.shape)))
+    assert_array_equal(points[:, :, 2], np.broadcast_to(Z[:, None], points.shape[:2]))
+    assert_array_equal(np.ptp(body.cells // section.n_nodes, axis=1), 1)
+    within = body.cells % section.n_nodes                                              # each lies above one triangle
+    assert {tuple(np.unique(cell)) for cell in within} == {tuple(cell) for cell in np.sort(section.cells, axis=1)}
     volumes = body.volumes.reshape(len(Z) - 1, len(section.cells), 3)
     prisms = np.diff(Z)[:, None, None] * section.volumes[:, None]
     assert_allclose(volumes, np.broadcast_to(prisms / 3, volumes.shape), rtol=1e-9)

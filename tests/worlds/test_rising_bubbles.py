@@ -21,42 +21,30 @@ def paths():
     return [long.target.path(long, episode_streams(seed).flow) for seed in range(20)]
 
 
-def visits(path):
-    """Yield the steps of each bubble that entered and left in the episode."""
-    steps = np.flatnonzero(path.present)
-    yield from np.split(steps, np.flatnonzero(np.diff(steps) > 1) + 1)[1:-1]
-
-
 def test_bubbles_cross_the_pipe_faster_than_the_flow():
-    """Each enters at the inlet, leaves at the outlet, and has the speed of the flow plus a constant slip."""
-    slips = []
+    """Each enters at the inlet, leaves at the outlet, and has the speed of the flow plus a constant
+    slip; its height follows y'' = −ω² (y − y₀). The waits have their mean."""
+    slips, waits = [], []
     for path in paths():
         assert 0.008 <= path.radius <= 0.012
-        for steps in visits(path):
+        changes = np.flatnonzero(np.diff(path.present.astype(int)))
+        waits += (DT * np.diff(changes)[int(path.present[0] == 0)::2]).tolist()
+        present = np.flatnonzero(path.present)
+        visits = np.split(present, np.flatnonzero(np.diff(present) > 1) + 1)
+        for steps in visits[1:-1]:                              # entered and left in the episode
             x, y = path.centres[steps].T
             assert x[0] == path.radius and x[-1] < LENGTH - path.radius <= x[-1] + 0.95 * DT
             assert np.abs(y).max() <= R - path.radius
             slip = np.diff(x) / DT - 0.45 * (1.0 - (y[:-1] / R)**2)
             np.testing.assert_allclose(slip, slip[0], rtol=1e-9)
             slips.append(slip[0])
-    assert min(slips) > 0.05 and max(slips) < 0.5 and len(slips) > 500
-    assert np.mean(slips) == pytest.approx(0.275, abs=0.025)
-
-
-def test_bubbles_oscillate_and_wait():
-    """The height follows y'' = −ω² (y − y₀), and the waits have their mean."""
-    waits = []
-    for path in paths():
-        changes = np.flatnonzero(np.diff(path.present.astype(int)))
-        gaps = np.diff(changes)[int(path.present[0] == 0)::2]
-        waits += [DT * gap for gap in gaps]
-        for steps in visits(path):
-            y = path.centres[steps, 1]
             if np.ptp(y) > 1e-3 and len(y) > 8:
                 curvature, centred = y[2:] - 2.0 * y[1:-1] + y[:-2], y[1:-1] - y[1:-1].mean()
                 slope = (curvature - curvature.mean()) @ centred / (centred @ centred)
                 frequency = np.arccos(1.0 + 0.5 * slope) / (2.0 * np.pi * DT)
                 assert 1.0 - 1e-6 <= frequency <= 3.0 + 1e-6
+    assert min(slips) > 0.05 and max(slips) < 0.5 and len(slips) > 500
+    assert np.mean(slips) == pytest.approx(0.275, abs=0.025)
     # a wait ends at the next step: half a step longer in the mean
     assert np.mean(waits) == pytest.approx(0.2 + 0.5 * DT, rel=0.1)
 
