@@ -61,20 +61,16 @@ def test_truth_is_the_best_there_is_on_these_nodes(env, changes):
     assert np.abs(example.truth - 28.0).max() < 3.0 * np.abs(truth - 28.0).max()       # beyond a region's edge too
 
 
-def test_errors_over_a_region_are_those_of_its_scores():
-    examples = eitbench.dataset(REGION, "train:0", world=WANDERING)
-    world, (example,) = examples.world, examples
-    estimate = 30.0 + np.random.default_rng(1).normal(size=example.truth.shape)
-    counted = integrals(world, cached_episode(world, 0))
-    expected = step_error(score_mass(world), estimate - world.background, *counted)
-    np.testing.assert_allclose(examples.errors(example, estimate), expected, rtol=1e-6)
-
-
 @pytest.mark.parametrize("env, changes", [(PIPE, FAST), (REGION, WANDERING)])
 def test_scores_are_the_same_in_few_coordinates(env, changes):
-    """Errors of estimates in the span of a basis, orthonormal or not, about any mean."""
+    """Errors are the scores of estimates, also over a region, and the same for estimates in the
+    span of a basis, orthonormal or not, about any mean."""
     examples = eitbench.dataset(env, "train:0", world=changes)
-    random = np.random.default_rng(2)
+    random, world = np.random.default_rng(2), examples.world
+    estimate = 30.0 + random.normal(size=examples[0].truth.shape)
+    expected = step_error(score_mass(world), estimate - world.background,
+                          *integrals(world, cached_episode(world, 0)))
+    np.testing.assert_allclose(examples.errors(examples[0], estimate), expected, rtol=1e-6)
     basis = random.normal(size=(examples.mesh.n_nodes, 3))
     for mean in (25.0, 30.0 + random.normal(size=len(basis))):
         reduced = examples.project(basis, mean)

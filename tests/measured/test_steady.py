@@ -9,7 +9,9 @@ from tanks import VESSEL, moving
 
 
 def test_correlation_is_matern():
-    """The correlation is (1 + λτ) e^−λτ; short steps compose to a long step, and the variance is stationary."""
+    """The correlation is (1 + λτ) e^−λτ; short steps compose to a long step, and the variance is
+    stationary. Q is ∫ e^Fs L Lᵀ e^Fᵀs ds of dx = F x dt + L dw, with λ = 1 and a spectral density
+    of 4."""
     for phase in (0.1, 1.0, 4.0):
         A, Q = matern32_transition(phase)
         assert A[0, 0] == pytest.approx((1 + phase) * np.exp(-phase))
@@ -17,10 +19,6 @@ def test_correlation_is_matern():
         assert np.linalg.eigvalsh(Q).min() > -1e-15
         short, _ = matern32_transition(phase / 8)
         np.testing.assert_allclose(np.linalg.matrix_power(short, 8), A, atol=1e-12)
-
-
-def test_process_noise_is_integrated_white_noise():
-    """Q is ∫ e^Fs L Lᵀ e^Fᵀs ds of dx = F x dt + L dw, with λ = 1 and a spectral density of 4."""
     phase = 0.7
     s = (np.arange(20_000) + 0.5) / 20_000 * phase
     responses = np.array([matern32_transition(each)[0] @ [0.0, 1.0] for each in s])

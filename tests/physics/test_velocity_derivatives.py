@@ -75,6 +75,11 @@ def assert_derivatives(velocity, directions, state, tolerance=1e-8, **settings):
         np.testing.assert_allclose(derivative, reference, atol=tolerance * np.abs(reference).max())
 
 
+def bent(mean, size):
+    """Return a flow in three dimensions."""
+    return lambda points: np.array(mean) + np.sin(points[:, [1, 2, 0]]) * size
+
+
 def skewed(speed):
     return moved(PlaneChannelFlow(speed, 0.25), SKEW, 0.7 * speed)
 
@@ -89,26 +94,19 @@ AXIAL = [PARABOLA, SKEW, FLAT]
     (skewed(1.0), AXIAL, {"diffusivity": 0.5}, 1e-8),
     (skewed(1e-3), AXIAL, {"diffusivity": 0.5}, 1e-8), (OBLIQUE, [eddy, PARABOLA], {}, 1e-8),
     (half, [half, PARABOLA, SKEW], {}, 1e-6), (still, [half, PARABOLA, eddy], {}, 1e-6),
+    (bent([1.0, 0.3, 0.2], 0.2), [bent([0.2, -0.5, 0.4], 1.0)],
+     {"mesh": box(), "inlet": np.arange(15)}, 1e-8),
 ], ids=["mild", "one sub-step", "convective", "diffusive", "creeping", "oblique", "partly at rest",
-        "at rest"])
-def test_derivatives_in_the_channel(flow, directions, changes, tolerance):
+        "at rest", "tetrahedra"])
+def test_derivatives_are_those_of_steps(flow, directions, changes, tolerance):
     """Derivatives equal central differences: along axial profiles from a skew base flow, in a flow
-    oblique to all cells, and without a flow in half of the channel, or anywhere, where they follow
-    the scheme along each direction.
+    oblique to all cells, without a flow in half of the channel, or anywhere, where they follow the
+    scheme along each direction, and in a deformed cube.
 
     Cell Péclet numbers are up to 17, to 7e7, and to 0.1 and 1e-4 with dominant diffusion.
     """
-    state = random_state(np.random.default_rng(0))
+    state = random_state(np.random.default_rng(0), *((60, 15) if "mesh" in changes else (91, 7)))
     assert_derivatives(flow, directions, state, tolerance, **changes)
-
-
-def test_derivatives_on_tetrahedra():
-    """Derivatives in a deformed cube, in three dimensions."""
-    mesh = box()
-    inlet = np.flatnonzero(np.arange(60) < 15)
-    flow, other = (lambda points, a=a, b=b: np.array(a) + np.sin(points[:, [1, 2, 0]]) * b
-                   for a, b in (([1.0, 0.3, 0.2], 0.2), ([0.2, -0.5, 0.4], 1.0)))
-    assert_derivatives(flow, [other], random_state(np.random.default_rng(2), 60, 15), mesh=mesh, inlet=inlet)
 
 
 def test_a_kink_counts_half_from_either_side():
