@@ -195,7 +195,8 @@ def test_the_score_in_the_readme_equals_errors(tiny, tmp_path, monkeypatch):
     assert names["score"] == pytest.approx(expected, rel=1e-12)
 
 
-def test_another_folder_is_not_touched(tiny, tmp_path):
+def test_another_folder_is_not_touched(tiny, tmp_path, monkeypatch):
+    """A missing library is named before anything is written."""
     (tmp_path / "mine.txt").write_text("mine")
     with pytest.raises(ValueError, match="out must be a new or empty folder"):
         export(tiny, tmp_path)
@@ -203,9 +204,6 @@ def test_another_folder_is_not_touched(tiny, tmp_path):
     export(tiny, tmp_path / "theirs")
     with pytest.raises(ValueError, match="another environment, format or version"):
         export(tiny, tmp_path / "theirs", "hdf5")
-
-
-def test_a_missing_library_is_named_before_anything_is_written(tiny, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "h5py", None)
     with pytest.raises(ModuleNotFoundError, match="format hdf5 needs the extra export"):
         export(tiny, tmp_path / "out", "hdf5")

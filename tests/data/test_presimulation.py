@@ -111,14 +111,6 @@ def test_predicted_size_is_that_of_the_files():
     assert cached_episode_bytes(PIPE_2D) == pytest.approx(881_000, rel=0.01)
 
 
-@pytest.mark.parametrize("seed", [-1, 1.0, True, "1"])
-def test_fill_names_what_is_wrong(seed):
-    with pytest.raises(ValueError, match="seeds must be an integer of at least 0"):
-        presimulate(TINY, [seed])
-    with pytest.raises(ValueError, match="n_jobs must be an integer of at least 1"):
-        presimulate(TINY, [1], n_jobs=0)
-
-
 def test_command_fills_and_resumes(place, asked, alone):
     """The command prints the numbers of new and cached episodes, and environments find them; dev:0 is not train:0."""
     code, said, _ = command("bank", "--seeds", "train:0-2", "-j", "1")

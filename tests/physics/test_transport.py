@@ -185,15 +185,22 @@ def test_sub_steps_converge_with_second_order():
 
 
 def test_evolution_model_is_the_step():
-    """F c + Y c_in is the step from a state to new inlet values; F, Y and H equal scipy's."""
+    """F c + Y c_in is the step from a state to new inlet values; F, Y and H equal scipy's. Γ_w = Y
+    Γ_η Yᵀ + H Γ_e Hᵀ is symmetric and positive semidefinite, and each variance weighs its own
+    matrix."""
     cd, rng = channel(), np.random.default_rng(3)
-    F, Y, _ = cd.evolution_model()
+    F, Y, H = cd.evolution_model()
     c, inflow = rng.normal(size=(91, 5)), rng.normal(size=(7, 5))
     batch = cd.step(c, c[cd.inlet], inflow)
     np.testing.assert_allclose(F @ c + Y @ inflow, batch, atol=1e-10)
     scipy = reference_flow(cd.mesh, FLOW, 4e-3, 0.2, substeps=4)
     for ours, theirs in zip(cd.evolution_model(), scipy.evolution_model(), strict=True):
         np.testing.assert_allclose(ours, theirs, rtol=0, atol=1e-12 * np.abs(theirs).max())
+    covariance = cd.evolution_model().state_noise_covariance(2.0, nodal_variance=0.3)
+    joint = np.hstack([Y, H]) @ np.diag([2.0] * 7 + [0.3] * 91) @ np.hstack([Y, H]).T
+    np.testing.assert_allclose(covariance, joint, atol=1e-14)
+    np.testing.assert_array_equal(covariance, covariance.T)
+    assert np.linalg.eigvalsh(covariance).min() > -1e-14
 
 
 def test_nodal_noise_is_a_source_over_the_step():
@@ -212,17 +219,6 @@ def test_nodal_noise_is_a_source_over_the_step():
     fine = channel(substeps=256).evolution_model().H @ e
     np.testing.assert_allclose(fine[free], exact, atol=2e-5)
     np.testing.assert_allclose(fine[cd.inlet], 0.0, atol=0.0)
-
-
-def test_state_noise_covariance_holds_both_noises():
-    """Γ_w = Y Γ_η Yᵀ + H Γ_e Hᵀ: symmetric, positive semidefinite, and each variance weighs its own matrix."""
-    evolution = channel().evolution_model()
-    covariance = evolution.state_noise_covariance(inflow_variance=2.0, nodal_variance=0.3)
-    joint = np.hstack([evolution.Y, evolution.H]) @ np.diag([2.0] * 7 + [0.3] * 91) @ np.hstack(
-        [evolution.Y, evolution.H]).T
-    np.testing.assert_allclose(covariance, joint, atol=1e-14)
-    np.testing.assert_array_equal(covariance, covariance.T)
-    assert np.linalg.eigvalsh(covariance).min() > -1e-14
 
 
 def test_fluid_enters_where_it_points_inwards():
