@@ -51,7 +51,7 @@ def test_seed_must_be_a_whole_number(seed):
     """Seeds that would be rounded or cast are rejected by name, and so is a wrong number of
     processes."""
     for function in (simulate, cached_episode, lambda world, seed: presimulate(world, [seed])):
-        with pytest.raises(ValueError, match="seeds? must be an integer of at least 0"):
+        with pytest.raises(ValueError, match=r"seeds? must be an integer of at least 0"):
             function(TINY, seed)
     with pytest.raises(ValueError, match="n_jobs must be an integer of at least 1"):
         presimulate(TINY, [1], n_jobs=0)

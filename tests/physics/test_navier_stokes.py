@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import pickle
-from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -13,20 +12,9 @@ from eitbench.physics.flow import PlaneChannelFlow
 from eitbench.physics.navier_stokes import SteadyFlow, steady_flow
 from numpy.testing import assert_allclose, assert_array_equal
 
-from shapes import polar_mesh, shaken_rectangle
-
-
-def uniform(*velocity):
-    """Return a field with this value everywhere."""
-    return lambda points: np.broadcast_to(np.array(velocity, dtype=float), points.shape)
-
+from shapes import orders, polar_mesh, shaken_rectangle, uniform
 
 AT_REST = uniform(0.0, 0.0)
-
-
-def orders(errors):
-    """Return log₂ of the reduction of the error by each halving of the cells."""
-    return np.array([np.log2(coarse / fine) for coarse, fine in pairwise(errors)])
 
 
 def side(mesh, axis, value):

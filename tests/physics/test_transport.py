@@ -1,6 +1,5 @@
 """Convection–diffusion against exact solutions, dense linear algebra, and itself."""
 
-from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -12,13 +11,7 @@ from eitbench.physics.flow import PlaneChannelFlow
 from eitbench.physics.transport import MIN_WIDE_COLUMNS, ConvectionDiffusion, _supg_matrices, inlet_nodes
 
 from references import reference_flow
-from shapes import box_mesh
-
-
-def uniform(*velocity):
-    """Return a field with this velocity everywhere."""
-    return lambda points: np.broadcast_to(np.array(velocity, dtype=float), points.shape)
-
+from shapes import box_mesh, orders, uniform
 
 FLOW = PlaneChannelFlow(1.0, 0.25)
 
@@ -39,11 +32,6 @@ def follow(cd, exact, steps):
     truth, mass = exact(points, steps * cd.time_step), mass_matrix(cd.mesh)
     error = c - truth
     return np.sqrt((error @ (mass @ error)) / (truth @ (mass @ truth)))
-
-
-def orders(errors):
-    """Return log₂ of the reduction of the error by each halving of the mesh or the step."""
-    return np.array([np.log2(coarse / fine) for coarse, fine in pairwise(errors)])
 
 
 def dense_step(cd, c, before, after, source=None):
