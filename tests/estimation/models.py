@@ -135,13 +135,11 @@ class QuadraticModel:
     def __init__(self, rng, n=6, electrodes=4):
         T = rng.normal(size=(n, electrodes, electrodes))
         self.T = T + T.transpose(0, 2, 1)
-        self.calls = 0
 
     def voltages(self, concentration, currents):
         return np.einsum("j,jlm,km->kl", concentration**2, self.T, currents)
 
     def linearise(self, concentration, currents):
-        self.calls += 1
         return (self.voltages(concentration, currents), np.einsum("j,jlm,km->klj", 2 * concentration, self.T, currents))
 
 
