@@ -59,6 +59,14 @@ def test_batch_equals_the_textbook(world):
             assert_close(S[t, b], (H @ predicted.covariance @ H.T).diagonal() + variance, 1e-10)
 
 
+def test_results_do_not_depend_on_the_batch(world):
+    """Results of a sequence are bit-identical alone and in a batch."""
+    model, records = world
+    together, alone = run(started(model, 3), records), run(started(model, 1), records[1:2])
+    for ours, theirs in zip(together, alone, strict=True):
+        np.testing.assert_array_equal(ours[:, 1:2], theirs)
+
+
 def test_full_rank_equals_the_full_filter(world):
     """At full rank, Φ a and Φ P Φᵀ equal the full filter for any mass matrix."""
     rng = np.random.default_rng(3)
