@@ -17,7 +17,7 @@ from eitbench.estimation.onboard.linearisation import linearisation_table, pair_
 from eitbench.estimation.onboard.models import load_or_build_learned
 from scipy.linalg import toeplitz
 
-from injection_envs import INFLOW, filter_of, make, some_pairs
+from injection_envs import BUDGET, FAULTS, INFLOW, filter_of, make, some_pairs
 
 
 @pytest.fixture(scope="module")
@@ -122,3 +122,14 @@ def test_expected_error_is_that_of_the_spread():
     covariance = by_state @ operator.filter.covariance[0] @ by_state.T
     mass = score_mass(env.unwrapped.world).toarray()
     assert expected == pytest.approx((mass * covariance).sum(), rel=1e-4)
+
+
+@pytest.mark.parametrize("name", [FAULTS, BUDGET])
+def test_other_environments_may_use_the_fitted_inflow(name):
+    """An argument selects the prior; world and episodes do not depend on it."""
+    env = make("reduced", name, inflow="learned")
+    assert env.unwrapped.world == make("none", name).unwrapped.world
+    env.reset(seed=1)
+    assert isinstance(filter_of(env).shared.single, InflowStates)
+    for action in some_pairs()[:4]:
+        assert np.isfinite(env.step(int(action))[1])
