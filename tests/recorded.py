@@ -1,5 +1,4 @@
-"""Comparison of cached episodes, and clearing of caches in memory."""
-
+"""Clearing of caches in memory."""
 
 from eitbench.data import cache, episode_cache
 
@@ -16,8 +15,3 @@ def forget_made(module):
     for value in vars(module).values():
         if hasattr(value, "cache_clear"):
             value.cache_clear()
-
-
-def bits(entries):
-    """Return the type, shape and bytes of a cached episode."""
-    return entries.dtype, entries.shape, entries.tobytes()

@@ -240,6 +240,16 @@ def write_mesh(path, mesh: Mesh, groups: dict | None = None) -> None:
     ).write(path, file_format="gmsh22", binary=False)
 
 
+def uniform(*velocity):
+    """Return a field with this value everywhere."""
+    return lambda points: np.broadcast_to(np.array(velocity, dtype=float), points.shape)
+
+
+def orders(errors):
+    """Return log₂ of the reduction of the error by each halving of the cells or steps."""
+    return np.array([np.log2(coarse / fine) for coarse, fine in pairwise(errors)])
+
+
 class RootLaw:
     """σ = (a − b√c) c: a nonlinear conductivity law."""
 

@@ -1,8 +1,9 @@
-"""A cache folder for each test, and one tiny episode."""
+"""A cache folder for each test, the simulated batches, and one tiny episode."""
 
 import pytest
+from eitbench.data import presimulation
 from eitbench.data.cache import CACHE_VARIABLE
-from eitbench.data.episodes import simulate
+from eitbench.data.episodes import simulate, simulate_batch
 
 from recorded import forget
 from tiny_worlds import TINY
@@ -15,6 +16,19 @@ def place(tmp_path, monkeypatch):
     forget()
     yield tmp_path / "cache"
     forget()
+
+
+@pytest.fixture
+def asked(monkeypatch):
+    """Return the seeds of each batch that this process simulates."""
+    batches = []
+
+    def counting(world, seeds, *more, **options):
+        batches.append(list(seeds))
+        return simulate_batch(world, seeds, *more, **options)
+
+    monkeypatch.setattr(presimulation, "simulate_batch", counting)
+    return batches
 
 
 @pytest.fixture(scope="session")

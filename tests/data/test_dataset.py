@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 import torch
 import yaml
-from eitbench.data import presimulation
 from eitbench.data.episode_cache import cached_episode, integrals, region_operators, score_mass, step_error
 from eitbench.data.episodes import simulate
 from eitbench.data.export import export
@@ -62,20 +61,16 @@ def test_truth_is_the_best_there_is_on_these_nodes(env, changes):
     assert np.abs(example.truth - 28.0).max() < 3.0 * np.abs(truth - 28.0).max()       # beyond a region's edge too
 
 
-def test_errors_over_a_region_are_those_of_its_scores():
-    examples = eitbench.dataset(REGION, "train:0", world=WANDERING)
-    world, (example,) = examples.world, examples
-    estimate = 30.0 + np.random.default_rng(1).normal(size=example.truth.shape)
-    counted = integrals(world, cached_episode(world, 0))
-    expected = step_error(score_mass(world), estimate - world.background, *counted)
-    np.testing.assert_allclose(examples.errors(example, estimate), expected, rtol=1e-6)
-
-
 @pytest.mark.parametrize("env, changes", [(PIPE, FAST), (REGION, WANDERING)])
 def test_scores_are_the_same_in_few_coordinates(env, changes):
-    """Errors of estimates in the span of a basis, orthonormal or not, about any mean."""
+    """Errors are the scores of estimates, also over a region, and the same for estimates in the
+    span of a basis, orthonormal or not, about any mean."""
     examples = eitbench.dataset(env, "train:0", world=changes)
-    random = np.random.default_rng(2)
+    random, world = np.random.default_rng(2), examples.world
+    estimate = 30.0 + random.normal(size=examples[0].truth.shape)
+    expected = step_error(score_mass(world), estimate - world.background,
+                          *integrals(world, cached_episode(world, 0)))
+    np.testing.assert_allclose(examples.errors(examples[0], estimate), expected, rtol=1e-6)
     basis = random.normal(size=(examples.mesh.n_nodes, 3))
     for mean in (25.0, 30.0 + random.normal(size=len(basis))):
         reduced = examples.project(basis, mean)
@@ -107,14 +102,25 @@ def test_modes_are_the_best_basis():
         examples.pod_modes(len(states) + 1)
 
 
-@pytest.mark.parametrize("basis, mean, message", [
-    (np.ones((3, 2)), None, "basis"), (np.ones((1, 2)), None, "some of these 2 depend"),
-    (np.full((1, 1), np.nan), None, "basis"), (None, np.zeros(3), "mean"), (None, "much", "mean must be an array")])
-def test_invalid_bases_are_explained(tiny, basis, mean, message):
-    n = tiny.mesh.n_nodes
-    basis = np.ones((n, 1)) if basis is None else np.repeat(basis, n, axis=0) if len(basis) == 1 else basis
+ONES = np.ones((1701, 1))
+
+
+@pytest.mark.parametrize("call, message", [
+    (lambda tiny: eitbench.dataset("eitbench/Nowhere-v0", "train:0"), "env must be one of"),
+    (lambda tiny: eitbench.dataset(PIPE, []), r"at least one episode, got \[\]"),
+    (lambda tiny: eitbench.dataset(PIPE, [1.5]), "seeds must be an integer"),
+    (lambda tiny: eitbench.dataset(PIPE, [3, 200_003]),
+     "must name the split .* 'test:3', got 200003"),
+    (lambda tiny: eitbench.dataset(PIPE, "200003"), "must name the split of test episodes"),
+    (lambda tiny: tiny.errors(tiny[0], tiny[0].truth[:-1]), "estimate must have shape"),
+    (lambda tiny: tiny.project(np.ones((3, 2))), "basis"),
+    (lambda tiny: tiny.project(np.repeat(ONES, 2, axis=1)), "some of these 2 depend"),
+    (lambda tiny: tiny.project(np.nan * ONES), "basis"),
+    (lambda tiny: tiny.project(ONES, np.zeros(3)), "mean"),
+    (lambda tiny: tiny.project(ONES, "much"), "mean must be an array")])
+def test_mistakes_are_explained(tiny, call, message):
     with pytest.raises(ValueError, match=message):
-        tiny.project(basis, mean)
+        call(tiny)
 
 
 def test_examples_contain_a_requested_flow():
@@ -125,34 +131,8 @@ def test_examples_contain_a_requested_flow():
     np.testing.assert_allclose(examples[0].velocity @ profiles.T, there, rtol=1e-9)
 
 
-@pytest.mark.parametrize("env, seeds, message", [
-    ("eitbench/Nowhere-v0", "train:0", "env must be one of"),
-    (PIPE, [], "at least one episode, got \\[\\]"),
-    (PIPE, [1.5], "seeds must be an integer"),
-    (PIPE, [3, 200_003], "must name the split .* 'test:3', got 200003"),
-    (PIPE, "200003", "must name the split of test episodes"),
-])
-def test_mistakes(env, seeds, message):
-    with pytest.raises(ValueError, match=message):
-        eitbench.dataset(env, seeds)
-
-
-def test_an_estimate_of_another_shape_is_refused(tiny):
-    with pytest.raises(ValueError, match="estimate must have shape"):
-        tiny.errors(tiny[0], tiny[0].truth[:-1])
-
-
-def test_iterating_simulates_few_at_a_time(monkeypatch, tmp_path):
+def test_iterating_simulates_few_at_a_time(place, asked):
     """Iteration simulates the next eight episodes only: memory is bounded."""
-    monkeypatch.setenv("EITBENCH_CACHE", str(tmp_path))
-    asked = []
-    simulated = presimulation.simulate_batch
-
-    def counting(world, seeds, *more):
-        asked.append(list(seeds))
-        return simulated(world, seeds, *more)
-
-    monkeypatch.setattr(presimulation, "simulate_batch", counting)
     stream = iter(eitbench.dataset(PIPE, "train:0-8", world=FAST))
     assert next(stream).seed == 0 and asked == [list(range(8))]
     assert [example.seed for example in stream] == list(range(1, 9)) and asked[1:] == [[8]]
@@ -215,7 +195,8 @@ def test_the_score_in_the_readme_equals_errors(tiny, tmp_path, monkeypatch):
     assert names["score"] == pytest.approx(expected, rel=1e-12)
 
 
-def test_another_folder_is_not_touched(tiny, tmp_path):
+def test_another_folder_is_not_touched(tiny, tmp_path, monkeypatch):
+    """A missing library is named before anything is written."""
     (tmp_path / "mine.txt").write_text("mine")
     with pytest.raises(ValueError, match="out must be a new or empty folder"):
         export(tiny, tmp_path)
@@ -223,9 +204,6 @@ def test_another_folder_is_not_touched(tiny, tmp_path):
     export(tiny, tmp_path / "theirs")
     with pytest.raises(ValueError, match="another environment, format or version"):
         export(tiny, tmp_path / "theirs", "hdf5")
-
-
-def test_a_missing_library_is_named_before_anything_is_written(tiny, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "h5py", None)
     with pytest.raises(ModuleNotFoundError, match="format hdf5 needs the extra export"):
         export(tiny, tmp_path / "out", "hdf5")

@@ -6,6 +6,7 @@ from eitbench.data import episodes
 from eitbench.data.cache import episode_key, store
 from eitbench.data.episode_cache import cached_episode
 from eitbench.data.episodes import Episode, cached_truth_model, simulate
+from eitbench.data.presimulation import presimulate
 from eitbench.worlds.catalogue import PIPE_2D
 from eitbench.worlds.random_streams import episode_streams
 
@@ -47,10 +48,13 @@ def test_no_cache_neither_reads_nor_writes(episode, place):
 
 @pytest.mark.parametrize("seed", [-1, 1.0, True, "7", None])
 def test_seed_must_be_a_whole_number(seed):
-    """Seeds that would be rounded or cast are rejected by name."""
-    for function in (simulate, cached_episode):
-        with pytest.raises(ValueError, match="seed must be an integer of at least 0"):
+    """Seeds that would be rounded or cast are rejected by name, and so is a wrong number of
+    processes."""
+    for function in (simulate, cached_episode, lambda world, seed: presimulate(world, [seed])):
+        with pytest.raises(ValueError, match=r"seeds? must be an integer of at least 0"):
             function(TINY, seed)
+    with pytest.raises(ValueError, match="n_jobs must be an integer of at least 1"):
+        presimulate(TINY, [1], n_jobs=0)
 
 
 def test_noise_and_resistances_belong_to_the_episode(episode):

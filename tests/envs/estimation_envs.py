@@ -2,7 +2,7 @@
 
 import gymnasium as gym
 import numpy as np
-from eitbench.worlds import entries, entry
+from eitbench.worlds import entries
 
 from short import short
 
@@ -13,8 +13,6 @@ OBSTACLE, SOLID = "eitbench/Pipe2DObstacle-v0", "eitbench/Pipe3D-v0"
 STIRRED, STILL = "eitbench/RotatingTank2D-v0", "eitbench/StationaryTank2D-v0"
 KINDS = [PIPE, LAGGED, SMOOTHING, UNKNOWN, SKEWED, OBSTACLE, SOLID, STIRRED, STILL]
 """One id of each kind of lag, flow, vessel and target; the others differ in numbers only."""
-VELOCITY = [id for id in ESTIMATION if entry(id).world.velocity_model is not None]
-"""Ids whose task requests the flow too."""
 
 
 def make(name: str, **kwargs) -> gym.Env:

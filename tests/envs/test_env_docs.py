@@ -61,16 +61,12 @@ def test_threshold_is_the_best_published_return(described):
     assert returns["random"] < threshold
 
 
-def test_arguments_are_those_of_the_environment(described):
-    """The page lists the arguments of the environment's class by name."""
+def test_arguments_and_numbers_are_those_of_the_environment(described):
+    """The page lists the arguments of the environment's class by name, and each parameter by its
+    name in the argument `world`, with value and meaning."""
     _, text, env = described
     listed = set(table(section(text, "Arguments"))) - {"name", "threads"}
     assert listed == set(inspect.signature(type(env)).parameters) - {"name"}
-
-
-def test_numbers_are_the_worlds(described):
-    """The page lists each parameter by its name in the argument `world`, with value and meaning."""
-    _, text, env = described
     values, meanings = (table(section(text, "World"), column) for column in (1, 2))
     for name, value in values.items():
         part = env.world

@@ -11,6 +11,9 @@ from injection_envs import BUDGET, FAULTS, FLOW, INFLOW, NAME, TANK
 @pytest.mark.parametrize(("id", "change", "message"), [
     (PIPE, {"lag": -1}, "lag must be an integer"),
     (PIPE, {"lag": "some"}, "lag must be 'all'"),
+    (PIPE, {"split": "test"}, "split must be train or dev"),
+    (PIPE, {"split": "all"}, "split must be train or dev"),
+    (PIPE, {"split": None}, "split must be train or dev"),
     (PIPE, {"render_mode": "tv"}, "render_mode must be"),
     (PIPE, {"episodes": 0}, "episodes must"),
     (PIPE, {"world": {"colour": 1}}, "world has no 'colour'; there are vessel, flow, target, inst"),
@@ -40,6 +43,8 @@ from injection_envs import BUDGET, FAULTS, FLOW, INFLOW, NAME, TANK
      "must leave two electrodes without fault, got up to 18 of 16"),
     (FAULTS, {"world": {"instrument": {"n_loose_range": "01"}}}, "n_loose_range must be an array of numbers, got str"),
     (BUDGET, {"world": {"schedule": {"budget": -1}}}, "budget must be"),
+    *((id, {"faults": "estimated"}, "faults must be 'gate' for an instrument without faults")
+      for id in (NAME, "eitbench/TankTracking-v0")),
 ])
 @pytest.mark.filterwarnings("ignore")
 def test_wrong_arguments_are_named(id, change, message):
@@ -77,11 +82,13 @@ def test_wrong_actions_are_named(id, action, message):
 
 @pytest.mark.parametrize("ask", ["truth", "true_velocity", "privileged_info"])
 def test_a_reset_is_required(ask):
-    """Rendering, steps and errors require a reset."""
+    """Rendering, steps and errors require a reset, which has no options."""
     env = make(PIPE).unwrapped
     with pytest.raises(gym.error.ResetNeeded, match=rf"call reset\(\) before {ask}\(\)"):
         getattr(env, ask)()
     with pytest.raises(gym.error.ResetNeeded, match=r"call reset\(\) before step\(\)"):
         env.step(np.full(1701, 30.0))
+    with pytest.raises(ValueError, match="options must be None or empty"):
+        env.reset(options={"split": "dev"})
     with pytest.raises(gym.error.ResetNeeded, match=r"call reset\(\) before error"):
         make(NAME).unwrapped.error  # noqa: B018

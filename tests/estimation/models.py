@@ -1,5 +1,6 @@
 """Small models for tests of estimators, and textbook algorithms with dense matrices for comparison."""
 
+from dataclasses import replace
 from functools import lru_cache
 from typing import NamedTuple
 
@@ -12,6 +13,7 @@ from eitbench.estimation import (
     Motion,
     NodalStates,
     OpenLoopCovariance,
+    VelocityPrior,
 )
 from eitbench.numerics.mesh import rectangle_mesh
 from eitbench.physics.transport import ConvectionDiffusion
@@ -133,13 +135,11 @@ class QuadraticModel:
     def __init__(self, rng, n=6, electrodes=4):
         T = rng.normal(size=(n, electrodes, electrodes))
         self.T = T + T.transpose(0, 2, 1)
-        self.calls = 0
 
     def voltages(self, concentration, currents):
         return np.einsum("j,jlm,km->kl", concentration**2, self.T, currents)
 
     def linearise(self, concentration, currents):
-        self.calls += 1
         return (self.voltages(concentration, currents), np.einsum("j,jlm,km->klj", 2 * concentration, self.T, currents))
 
 
@@ -147,6 +147,14 @@ class QuadraticModel:
 def tiny_task():
     """Return the task of the tiny world."""
     return make_task(TINY)
+
+
+@lru_cache(maxsize=2)
+def tiny_prior(link="logarithm"):
+    """Return a prior of two modes across the inlet of the tiny world, correlated over four
+    steps."""
+    transport = tiny_task().transport
+    return two_modes(transport.mesh.points[transport.inlet], transport.time_step, link)
 
 
 def window_law(space):
@@ -204,11 +212,24 @@ def shapes(k):
     return np.stack([profile(HEIGHTS) for profile in PROFILES[:k]], axis=1)
 
 
-def coarse_transport(theta, diffusivity):
+def coarse_transport(theta, diffusivity=1e-2):
     """Return the transport with v = Σ θ_k v_k; at a mean velocity of 4.5 m/s the residence time is 18 steps."""
     fields = directions(len(theta))
     return ConvectionDiffusion(MESH, lambda points: sum(t * v(points) for t, v in zip(theta, fields, strict=True)),
                                diffusivity, 5e-3, substeps=4, inlet=np.arange(7))
+
+
+@lru_cache(maxsize=2)
+def coarse_task(theta=(4.5,)):
+    """Return the task of the tiny world in the coarse pipe."""
+    return replace(make_task(TINY), transport=coarse_transport(theta))
+
+
+def flow_prior(initial, std, walk):
+    """Return the prior of v = Σ θ_k v_k in the coarse pipe."""
+    k = len(initial)
+    return VelocityPrior(coarse_transport, directions(k), np.array(initial),
+                         np.array(std), np.array(walk), shapes(k))
 
 
 def averages(mesh, random, m):

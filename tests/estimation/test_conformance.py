@@ -1,6 +1,5 @@
 """All state spaces and covariance forms agree with the joint Gaussian of all states given all measurements."""
 
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -13,7 +12,6 @@ from eitbench.estimation import (
     Motion,
     NodalStates,
     VelocityInflowWindow,
-    VelocityPrior,
     VelocityStates,
     fixed_interval_smoother,
     kalman_filter,
@@ -24,20 +22,19 @@ from eitbench.estimation import (
 )
 from eitbench.estimation.walk import matern32_transition
 from eitbench.worlds.catalogue import PIPE_2D
-from eitbench.worlds.task import make_task
 from models import (
     MESH,
     Gaussian,
     LinearGaussian,
     assert_close,
     by_window,
+    coarse_task,
     coarse_transport,
     dense_filter,
-    directions,
     draw,
+    flow_prior,
     random_design,
     random_model,
-    shapes,
     stacked,
     theta_of,
     two_modes,
@@ -45,10 +42,9 @@ from models import (
 )
 from scipy.linalg import block_diag
 
-from tiny_worlds import TINY
-
 T, LEVEL = 6, 29.0
 THETA = np.array([4.0, 0.5])
+KNOWN_FLOW = flow_prior(THETA, np.zeros(2), np.zeros(2))
 
 
 def nodal(covariance, motions):
@@ -92,27 +88,19 @@ def modal():
     return Filter(modal_states(5, 0.7, lambda time: (A, Q))), [model] * T
 
 
-def coarse_task():
-    return replace(make_task(TINY), transport=coarse_transport(THETA, 1e-2))
-
-
 def inflow_window():
-    space = InflowWindow(coarse_task(), two_modes(MESH.points[:7], link="linear"), LEVEL, lag=T)
+    prior = two_modes(MESH.points[:7], link="linear")
+    space = InflowWindow(coarse_task(tuple(THETA)), prior, LEVEL, lag=T)
     return Filter(space), [window_law(space)] * T
-
-
-def known_flow(k=2):
-    return VelocityPrior(lambda theta: coarse_transport(theta, 1e-2), directions(k), THETA[:k], np.zeros(k),
-                         np.zeros(k), shapes(k))
 
 
 def velocity():
     """Return a filter with known θ; the state ends with θ."""
-    task = coarse_task()
+    task = coarse_task(tuple(THETA))
     F, Y = task.transport.transition()
     n, none = len(F), np.zeros((2, 2))
     noise = task.evolution.state_noise_covariance((LEVEL / 4)**2, (LEVEL / 50)**2)
-    space = VelocityStates(task, LEVEL, known_flow())
+    space = VelocityStates(task, LEVEL, KNOWN_FLOW)
     full, Q, covariance = (block_diag(*each) for each in (
         (F, np.eye(2)), (noise, none), ((LEVEL / 4)**2 * np.eye(n), none)))
     model = LinearGaussian(full, np.concatenate([LEVEL * Y.sum(axis=1), np.zeros(2)]), Q,
@@ -288,7 +276,7 @@ def test_derivatives_of_log_states():
 
 def test_the_pipe_of_the_thesis():
     """The filter with the parameters of Table 5.1, and its smoother, agree with dense matrices assembled here."""
-    transport, n = coarse_transport([4.5], 1e-2), len(MESH.points)
+    transport, n = coarse_transport([4.5]), len(MESH.points)
     evolution = transport.evolution_model()
     noise = evolution.state_noise_covariance((LEVEL / 4)**2, (LEVEL / 50)**2)
     model = LinearGaussian(evolution.F, evolution.Y.sum(axis=1) * LEVEL, noise, np.full(n, LEVEL),
@@ -322,9 +310,9 @@ def test_several_blocks_of_a_dense_covariance():
 
 def test_windows_with_a_known_velocity_are_the_inflow_window():
     """The difference is at most 1e-3 of the deviation, the truncated part of the response."""
-    task, prior = coarse_task(), two_modes(MESH.points[:7], link="linear")
+    task, prior = coarse_task(tuple(THETA)), two_modes(MESH.points[:7], link="linear")
     other = Filter(InflowWindow(task, prior, LEVEL))
-    filter_ = Filter(VelocityInflowWindow(task, prior, LEVEL, known_flow(), other.space.window_steps))
+    filter_ = Filter(VelocityInflowWindow(task, prior, LEVEL, KNOWN_FLOW, other.space.window_steps))
     seen, _ = measured(other, range(4))
     for each in (filter_, other):
         run(each, seen)

@@ -5,7 +5,6 @@ from dataclasses import replace
 from itertools import product
 from pathlib import Path
 
-import gymnasium as gym
 import numpy as np
 import pytest
 from eitbench.data.episode_cache import instrument_faults
@@ -33,14 +32,7 @@ SEEDS = [1, 2, 3]
 PRIOR = [1.0 - 1.0 / L - 0.5 / L, 1.0 / L, 0.5 / L]
 
 
-def signal_covariance(random: np.random.Generator) -> np.ndarray:
-    """Return the covariance of correlated voltages of 20 mV."""
-    root = random.standard_normal((L, 3))
-    return 0.02**2 * root @ root.T
-
-
-def exact_probabilities(voltages: np.ndarray, predicted: np.ndarray,
-                        signal: np.ndarray) -> np.ndarray:
+def exact_probabilities(voltages, predicted, signal) -> np.ndarray:
     """Return the probabilities (L, 3) by enumeration of the states of all electrodes."""
     low, high = INSTRUMENT.loose_resistance
     driven = CURRENTS != 0.0
@@ -67,7 +59,8 @@ def draws(count: int) -> list[tuple[np.ndarray, ...]]:
     random = np.random.default_rng(5)
     drawn = []
     for _ in range(count):
-        signal = signal_covariance(random)
+        root = random.standard_normal((L, 3))
+        signal = 0.02**2 * root @ root.T                   # correlated voltages of 20 mV
         predicted = random.uniform(-0.2, 0.2, L)
         faults = INSTRUMENT.draw(random, L, 10)
         resistance = faults.resistance * (CURRENTS != 0.0)
@@ -87,8 +80,7 @@ def test_probabilities_are_near_those_of_enumeration() -> None:
     assert faults.probabilities[0, 0] == pytest.approx(PRIOR)
     faults.update(voltages, voltages - predicted, signal, np.full((count, L), NOISE**2),
                   np.tile(CURRENTS, (count, 1)))
-    exact = np.array([exact_probabilities(*each) for each in
-                      zip(voltages, predicted, signal, strict=True)])
+    exact = np.array(list(map(exact_probabilities, voltages, predicted, signal)))
     difference = np.abs(faults.probabilities - exact)
     assert difference.mean() < 0.03                                  # 0.16 after the first sweep
     decided = faults.probabilities[..., BROKEN] > 0.5
@@ -112,7 +104,7 @@ def played() -> tuple[InjectionCore, np.ndarray]:
     return play(RULES, SEEDS)
 
 
-def test_faults_of_the_environment_are_found(played: tuple[InjectionCore, np.ndarray]) -> None:
+def test_faults_of_the_environment_are_found(played):
     """At the end of an episode all broken wires and bad contacts are known; other electrodes are intact."""
     core, _ = played
     probabilities = core._filters.faults.probabilities
@@ -126,8 +118,7 @@ def test_faults_of_the_environment_are_found(played: tuple[InjectionCore, np.nda
     assert probabilities[~late & ~loose, LOOSE].max() < 0.1
 
 
-def test_a_filter_with_estimated_faults_is_as_good_as_with_known_ones(
-        played: tuple[InjectionCore, np.ndarray], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_filter_with_estimated_faults_is_as_good_as_with_known_ones(played, monkeypatch):
     core, errors = played
     monkeypatch.setattr(episode_filters, "ElectrodeFaults",
                         lambda instrument, shape, n_steps: KnownFaults(instrument, n_steps, core.faults))
@@ -135,7 +126,7 @@ def test_a_filter_with_estimated_faults_is_as_good_as_with_known_ones(
     assert np.nanmean(errors, axis=0) == pytest.approx(np.nanmean(told, axis=0), rel=0.02)
 
 
-def test_full_filter_finds_the_same_faults(played: tuple[InjectionCore, np.ndarray]) -> None:
+def test_full_filter_finds_the_same_faults(played):
     core, errors = played
     full, full_errors = play(RULES, SEEDS[:1], "full")
     assert np.nanmean(full_errors) == pytest.approx(np.nanmean(errors[:, 0]), rel=0.03)
@@ -143,7 +134,7 @@ def test_full_filter_finds_the_same_faults(played: tuple[InjectionCore, np.ndarr
                                core._filters.faults.probabilities[0], atol=0.05)
 
 
-def test_an_episode_does_not_depend_on_the_others(played: tuple[InjectionCore, np.ndarray]) -> None:
+def test_an_episode_does_not_depend_on_the_others(played):
     np.testing.assert_array_equal(play(RULES, SEEDS[1:2])[1][:, 0], played[1][:, 1])
 
 
@@ -159,7 +150,7 @@ def test_without_faults_the_filter_is_the_plain_one() -> None:
     np.testing.assert_allclose(np.nanmean(estimated, axis=0), np.nanmean(plain, axis=0), rtol=0.02)
 
 
-def test_criteria_avoid_broken_electrodes(played: tuple[InjectionCore, np.ndarray]) -> None:
+def test_criteria_avoid_broken_electrodes(played):
     core, _ = played
     belief = Belief(RULES, {name: array[0] for name, array in core.observe().items()})
     probabilities = belief._filters.faults.probabilities
@@ -181,9 +172,3 @@ def test_open_inputs_may_measure_zero() -> None:
     broken = core.faults.open_circuit_from <= core.t - 16
     assert core._filters.faults.probabilities[broken, BROKEN].min() > 0.99
     assert np.isfinite(errors[-1]).all()
-
-
-@pytest.mark.parametrize("id", ["eitbench/Pipe2DInjection-v0", "eitbench/TankTracking-v0"])
-def test_estimated_faults_require_an_instrument_with_faults(id: str) -> None:
-    with pytest.raises(ValueError, match="faults must be 'gate' for an instrument without faults"):
-        gym.make(id, faults="estimated")

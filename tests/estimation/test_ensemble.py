@@ -2,7 +2,6 @@
 filter."""
 
 from dataclasses import replace
-from functools import lru_cache
 
 import numpy as np
 import pytest
@@ -11,25 +10,16 @@ from eitbench.estimation import (
     Filter,
     InflowWindow,
     LinearMeasurement,
-    VelocityPrior,
     inflow_response,
     linearise_at_prediction,
 )
 from eitbench.worlds.task import make_task
-from models import MESH, averages, coarse_transport, directions, shapes, textbook_update, two_modes
+from models import MESH, averages, coarse_task, coarse_transport, flow_prior, two_modes
+from models import textbook_update as textbook
 
 from tiny_worlds import TINY
 
 LEVEL = 29.0
-
-
-def transport_at(theta):
-    return coarse_transport(theta, 1e-2)
-
-
-@lru_cache(maxsize=1)
-def task():
-    return replace(make_task(TINY), transport=transport_at([4.5]))
 
 
 def prior(link):
@@ -37,10 +27,9 @@ def prior(link):
 
 
 def ensemble(link="logarithm", members=40, std=0.5, spin_up_steps=24):
-    flow = VelocityPrior(transport_at, directions(1), np.array([4.5]), np.array([std]), np.array([0.1 * std]),
-                         shapes(1))
-    return EnsembleFilter(task(), prior(link), LEVEL, flow, members, spin_up_steps, np.random.default_rng(0),
-                          linearise_at_prediction(task()))
+    flow = flow_prior([4.5], [std], [0.1 * std])
+    return EnsembleFilter(coarse_task(), prior(link), LEVEL, flow, members, spin_up_steps,
+                          np.random.default_rng(0), linearise_at_prediction(coarse_task()))
 
 
 def observation(seed=5, m=6, variance=0.1):
@@ -65,7 +54,7 @@ def test_a_measurement_is_the_kalman_update_of_the_members_moments():
     estimate = filter_.estimate()
     innovation, covariance = estimate.innovation, estimate.innovation_covariance
     n, P = len(MESH.points), np.cov(before)
-    mean, less, S = textbook_update(before.mean(axis=1), P, *seen[:3])
+    mean, less, S = textbook(before.mean(axis=1), P, *seen[:3])
     np.testing.assert_allclose(innovation, seen.value - seen.matrix @ before[:n].mean(axis=1), rtol=1e-9)
     np.testing.assert_allclose(covariance, S, rtol=1e-9)
     after = together(filter_)
@@ -82,7 +71,7 @@ def test_members_are_advected_with_their_velocities():
     entered = filter_.c_ref * np.exp(filter_.prior.modes @ filter_.inflows[0])
     filter_.predict()
     enters = filter_.c_ref * np.exp(filter_.prior.modes @ filter_.inflows[0])
-    own, mean = (np.stack([transport_at(theta).step(before[:, i], entered[:, i], enters[:, i])
+    own, mean = (np.stack([coarse_transport(theta).step(before[:, i], entered[:, i], enters[:, i])
                            for i, theta in enumerate(flows)], axis=1)
                  for flows in (filter_.parameters.T, np.tile(filter_.parameters.mean(axis=1), (24, 1))))
     assert np.abs(filter_.concentration - own).max() < 0.02 * np.abs(mean - own).max()
@@ -93,7 +82,7 @@ def test_many_members_give_the_kalman_filter(monkeypatch):
     of its change, and variances to 15 %, five standard errors of 2,000 members."""
     monkeypatch.setattr(inflow_response, "DECAY_TOLERANCE", 1e-6)
     filter_ = ensemble("linear", 2000, std=0.0, spin_up_steps=60)
-    exact = Filter(InflowWindow(task(), prior("linear"), LEVEL))
+    exact = Filter(InflowWindow(coarse_task(), prior("linear"), LEVEL))
     for seed in range(4):
         for each in (filter_, exact):
             each.predict()
@@ -111,4 +100,4 @@ def test_invalid_arguments_are_rejected():
         ensemble(members=1)
     with pytest.raises(ValueError, match="the prior must be for the task's inlet"):
         EnsembleFilter(make_task(TINY), prior("linear"), LEVEL, ensemble().flow, 10, 2, np.random.default_rng(0),
-                       linearise_at_prediction(task()))
+                       linearise_at_prediction(coarse_task()))

@@ -55,29 +55,33 @@ def test_total_variation_is_the_minimum_of_its_objective():
     assert np.abs(found - expected.x).max() < 0.03
 
 
-def recorded(n_steps):
-    """Return the task of the 2D pipe with four electrodes, and measurements of a wrong, varying concentration."""
+def recorded(method, n_steps, missing=None):
+    """Return the last estimate of a method for the 2D pipe with four electrodes from measurements
+    of a wrong, varying concentration, some of them missing; the task, the method's constants and
+    ĉ_bh; the measurements, and voltages and derivatives of the model at ĉ_bh."""
     task = replace(make_task(TINY), n_steps=n_steps)
     rng, n = np.random.default_rng(2), task.mesh.n_nodes
     currents = task.currents[np.arange(n_steps) % len(task.currents)]
     clean = task.observation.voltages(28.0 + 2.0 * np.sin(20.0 * task.mesh.points[:, 0]), currents)
-    return task, clean + task.noise.std(clean) * rng.normal(size=clean.shape), currents, n
-
-
-def test_temporal_regularisation_conditions_one_gaussian_of_all_states():
-    """Mean and variance equal the stacked states' with covariance γ^|i−j| Γ, given the window and its NaN."""
-    n_steps = 20
-    task, voltages, currents, n = recorded(n_steps)
-    voltages[7, 3] = np.nan
-    method = load_method("temporal_regularisation", "estimation")
-    estimator = method.make(task)
-    module = type(estimator).__init__.__globals__
+    voltages = clean + task.noise.std(clean) * rng.normal(size=clean.shape)
+    if missing:
+        voltages[missing] = np.nan
+    estimator = load_method(method, "estimation").make(task)
     for V, I in zip(voltages, currents, strict=True):
         estimate = estimator.update(V, I)
     first = task.calibration
     c_ref = best_homogeneous(task.observation, task.noise, n, voltages[:first], currents[:first],
                              task.expected_concentration)
-    computed, jacobian = task.observation.linearise(np.full(n, c_ref), currents)
+    at_reference = task.observation.linearise(np.full(n, c_ref), currents)
+    return estimate, task, type(estimator).__init__.__globals__, c_ref, voltages, *at_reference
+
+
+def test_temporal_regularisation_conditions_one_gaussian_of_all_states():
+    """Mean and variance equal the stacked states' with covariance γ^|i−j| Γ, given the window and
+    its NaN."""
+    n_steps = 20
+    estimate, task, module, c_ref, voltages, computed, jacobian = recorded(
+        "temporal_regularisation", n_steps, (7, 3))
     prior = smoothness_covariance(task.mesh, module["LENGTH"], module["STD"] * c_ref)
     window = np.arange(n_steps - module["WINDOW"], n_steps)
     kept = np.isfinite(voltages[window])
@@ -94,24 +98,20 @@ def test_temporal_regularisation_conditions_one_gaussian_of_all_states():
 
 def test_random_walk_filter_conditions_one_gaussian_of_all_states():
     """Mean and variance equal x_0 + Σ e_i's, with a Matérn covariance of x_0 and each e_i."""
-    task, voltages, currents, n = recorded(8)
-    estimator = load_method("random_walk_filter", "estimation").make(task)
-    module = type(estimator).__init__.__globals__
-    for V, I in zip(voltages, currents, strict=True):
-        estimate = estimator.update(V, I)
-    c_ref = best_homogeneous(task.observation, task.noise, n, voltages[:task.calibration], currents[:task.calibration],
-                             task.expected_concentration)
-    computed, jacobian = task.observation.linearise(np.full(n, c_ref), currents)
+    n_steps = 8
+    estimate, task, module, c_ref, voltages, computed, jacobian = recorded(
+        "random_walk_filter", n_steps)
     step = smoothness_covariance(task.mesh, module["LENGTH"], module["STEP"] * c_ref)
     initial = smoothness_covariance(task.mesh, module["LENGTH"], module["INITIAL_STD"] * c_ref)
-    steps = np.arange(1, len(voltages) + 1)
-    H, times = jacobian.reshape(-1, n), np.repeat(steps, voltages.shape[1])
+    H = jacobian.reshape(voltages.size, -1)
+    times = np.repeat(np.arange(1, n_steps + 1), voltages.shape[1])
     shared = np.minimum(times[:, None], times)
     S = H @ initial @ H.T + shared * (H @ step @ H.T) + np.diag(task.noise.std(computed).ravel()**2)
     cross = H @ initial + times[:, None] * (H @ step)
     solution = np.linalg.solve(S, (voltages - computed).ravel())
     np.testing.assert_allclose(estimate.mean, c_ref + solution @ cross, rtol=1e-8)
-    expected = (initial + len(voltages) * step).diagonal() - (cross * np.linalg.solve(S, cross)).sum(axis=0)
+    reduction = (cross * np.linalg.solve(S, cross)).sum(axis=0)
+    expected = (initial + n_steps * step).diagonal() - reduction
     np.testing.assert_allclose(estimate.variance, expected, rtol=1e-7)
 
 

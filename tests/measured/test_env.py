@@ -193,40 +193,23 @@ def test_measurements_of_an_episode_give_the_same_estimates(tmp_path, name, worl
     assert estimates > task.warm_up
 
 
-def located(measurements, **options):
-    """Return environment, run and centroid of the inclusion at the end."""
-    env = MeasuredEnv(measurements, VESSEL, **FIXED_STDS | options)
-    run = run_on_measurements(env, "log_walk_filter")
-    return env, run, centroid(env.task.mesh.points, run.mean[-1])
-
-
-@pytest.fixture(scope="module")
-def clean(coarse, measurements):
-    """Return run and centroid of the complete measurements."""
-    return located(measurements)[1:]
-
-
-def test_lost_measurements_are_left_out_one_by_one(measurements, clean):
-    """If 5 % are lost all channels are used, and the inclusion is within 5 mm of the complete data's."""
-    complete, position = clean
-    lost = np.random.default_rng(0).random(measurements.voltages.shape) < 0.05
-    env, run, found = located(replace(measurements, voltages=np.where(lost, np.nan, measurements.voltages)))
-    assert env.available.all()
-    assert np.linalg.norm(found - position) < 5e-3
-    assert run.withheld_rmse == pytest.approx(complete.withheld_rmse, rel=0.2)
-
-
-def test_spikes_are_named_and_left_out(measurements, clean):
-    """Voltages ten times too large change neither the estimate nor the score by a fifth; motion is not a spike."""
-    complete, position = clean
+def test_lost_measurements_and_spikes_are_left_out_one_by_one(measurements):
+    """If 5 % are lost, and two voltages are ten times too large, all channels are used, the spikes
+    are named, the inclusion is within 5 mm of the complete data's, and the score changes by less
+    than a fifth. Motion is not a spike."""
     assert not find_spikes(measurements.voltages, measurements.injection_index).any()
     voltages = measurements.voltages.copy()
-    voltages[3, 6] *= 10                                # in the first frame, which calibrates
-    voltages[8 * 5 + 3, 6] *= 10
-    env, run, found = located(replace(measurements, voltages=voltages))
+    voltages[np.random.default_rng(0).random(voltages.shape) < 0.05] = np.nan
+    for row in (3, 8 * 5 + 3):                          # also in the first frame, which calibrates
+        voltages[row, 6] = 10 * measurements.voltages[row, 6]
+    whole, damaged = (MeasuredEnv(each, VESSEL, **FIXED_STDS) for each in (
+        measurements, replace(measurements, voltages=voltages)))
+    assert damaged.available.all()
     for frame in (1, 6):
-        assert f"frame {frame}, injection 4, channel 7" in env.quality_warnings()[0]
-    assert np.linalg.norm(found - position) < 5e-3
+        assert f"frame {frame}, injection 4, channel 7" in damaged.quality_warnings()[0]
+    complete, run = (run_on_measurements(env, "log_walk_filter") for env in (whole, damaged))
+    expected, found = (centroid(whole.task.mesh.points, each.mean[-1]) for each in (complete, run))
+    assert np.linalg.norm(found - expected) < 5e-3
     assert run.withheld_rmse == pytest.approx(complete.withheld_rmse, rel=0.2)
     assert run.withheld_rmse_volts == pytest.approx(complete.withheld_rmse_volts, rel=0.2)
 

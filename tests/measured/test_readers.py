@@ -14,12 +14,13 @@ CURRENTS, MATRIX = instrument()
 VALUES = np.random.default_rng(0).normal(size=(8, 8))
 
 
-def test_ktc(tmp_path):
+@pytest.mark.parametrize("stored", [np.asarray, csc_array], ids=["dense", "sparse"])
+def test_ktc(tmp_path, stored):
     """Columns are injections and patterns; voltages are in the order of injections, in mA and V."""
-    patterns = {"Inj": 1e3 * CURRENTS.T, "Mpat": MATRIX.T}
-    savemat(tmp_path / "data1.mat", patterns | {"Uel": VALUES.reshape(-1, 1)})
-    empty = {"Injref": patterns["Inj"], "Mpat": patterns["Mpat"], "Uelref": 2 * VALUES.reshape(-1, 1)}
-    savemat(tmp_path / "ref.mat", empty)
+    injections, patterns = stored(1e3 * CURRENTS.T), stored(MATRIX.T)
+    values = VALUES.reshape(-1, 1)
+    savemat(tmp_path / "data1.mat", {"Inj": injections, "Mpat": patterns, "Uel": values})
+    savemat(tmp_path / "ref.mat", {"Injref": injections, "Mpat": patterns, "Uelref": 2 * values})
     measurements = read(tmp_path / "data1.mat")
     np.testing.assert_allclose(measurements.currents, CURRENTS, atol=1e-15)
     np.testing.assert_array_equal(measurements.matrix, MATRIX)
@@ -40,14 +41,25 @@ def test_kit4(tmp_path):
 
 
 def test_eidors(tmp_path):
-    """A frame has 256 numbers; measurements with an injecting electrode are missing."""
+    """A frame has 256 numbers; measurements with an injecting electrode are missing. Variables are
+    named if the names are not the usual ones, and must hold numbers."""
     frames = np.random.default_rng(1).uniform(1, 2, (256, 3))
-    savemat(tmp_path / "tank.mat", {"v_rotate": frames, "v_reference": frames[:, :1]})
-    measurements = read(tmp_path / "tank.mat")
-    assert measurements.voltages.shape == (48, 16)
-    assert np.isnan(measurements.voltages[17, [0, 1, 2]]).all()
-    assert measurements.voltages[17, 5] == -frames[16 + 5, 1]
-    assert measurements.reference.shape == (1, 16, 16)
+    savemat(tmp_path / "usual.mat", {"v_rotate": frames, "v_reference": frames[:, :1]})
+    path = tmp_path / "other.mat"
+    savemat(path, {"mine": frames, "water": frames[:, :1], "text": "abc",
+                   "cell": np.array([1, "a"], object)})
+    for measurements in (read(tmp_path / "usual.mat"), read(path, name="mine", reference="water")):
+        assert measurements.voltages.shape == (48, 16)
+        assert np.isnan(measurements.voltages[17, [0, 1, 2]]).all()
+        assert measurements.voltages[17, 5] == -frames[16 + 5, 1]
+        assert measurements.reference.shape == (1, 16, 16)
+    for options, message in (
+            ({}, "one of mine, water"),
+            ({"colour": 1}, "must be among name, reference, got colour"),
+            ({"name": "text"}, "text must be a numeric array, got a character array"),
+            ({"name": "cell"}, "cell must be a numeric array, got a cell array")):
+        with pytest.raises(ValueError, match=message):
+            read(path, **options)
 
 
 def eit_file(path, potentials, *, second=0.0):
@@ -134,37 +146,37 @@ def test_a_lost_potential_or_a_spike_does_not_shift_the_others(tmp_path):
     assert np.isnan(found[17, 1]) and found[30, 4] > 50.0 * np.abs(VALUES).max()
 
 
-@pytest.mark.parametrize(("options", "message"), [
-    ({}, r"described by a YAML file.*comma\.yml"),
-    ({"electrodes": 8, "current": 1e-3}, "numbers with the decimal point '.'"),
-    ({"electrodes": 9, "current": 1e-3, "decimal": ","}, "rows must have 11 columns"),
-    ({"electrodes": 8, "current": -1.0, "decimal": ","}, "current must be"),
-    ({"electrodes": 8, "current": 1.0, "unit": "mV"}, "unit must be a number in V.*got 'mV'"),
-])
-def test_invalid_tables_are_rejected(tmp_path, options, message):
-    with pytest.raises(ValueError, match=message):
-        read(table(tmp_path / "comma.csv", decimal=",", separator=";"), **options)
-
-
 KTC = {"Inj": CURRENTS.T, "Mpat": MATRIX.T, "Uel": VALUES}
+COMMA = {"electrodes": 8, "current": 1e-3, "decimal": ","}
+"""Description of a table with decimal commas."""
 
 
-@pytest.mark.parametrize(("content", "name", "format", "message"), [
-    (None, "a.mat", None, "got a missing path"),
-    (b"MATLAB 7.3 MAT-file".ljust(124) + b"\x00\x02IM" + bytes(500), "a.mat", None, "`save -v7` writes: .*v7.3"),
-    (b"", "a.mat", None, r"a\.mat must"),
-    (b"MATLAB 5.0 MAT-file" + bytes(300), "a.mat", None, r"a\.mat must"),
-    ({"Inj": CURRENTS.T, "Uel": VALUES}, "a.mat", None, "must hold Mpat, got"),
-    (KTC | {"Uel": np.full_like(VALUES, np.nan)}, "a.mat", None, r"a\.mat: voltages must hold numbers, got NaN only"),
-    (b"x", "a.jpg", None, "must end in"), (KTC, "a.mat", "excel", "format must be one of")])
-def test_invalid_files_are_rejected(tmp_path, content, name, format, message):
+@pytest.mark.parametrize(("content", "name", "options", "message"), [
+    (None, "a.mat", {}, "got a missing path"),
+    (b"MATLAB 7.3 MAT-file".ljust(124) + b"\x00\x02IM" + bytes(500), "a.mat", {},
+     "`save -v7` writes: .*v7.3"),
+    (b"", "a.mat", {}, r"a\.mat must"),
+    (b"MATLAB 5.0 MAT-file" + bytes(300), "a.mat", {}, r"a\.mat must"),
+    ({"Inj": CURRENTS.T, "Uel": VALUES}, "a.mat", {}, "must hold Mpat, got"),
+    (KTC | {"Uel": np.full_like(VALUES, np.nan)}, "a.mat", {},
+     r"a\.mat: voltages must hold numbers, got NaN only"),
+    (b"x", "a.jpg", {}, "must end in"),
+    (KTC, "a.mat", {"format": "excel"}, "format must be one of"),
+    (table, "comma.csv", {}, r"described by a YAML file.*comma\.yml"),
+    (table, "comma.csv", COMMA | {"decimal": "."}, "numbers with the decimal point '.'"),
+    (table, "comma.csv", COMMA | {"electrodes": 9}, "rows must have 11 columns"),
+    (table, "comma.csv", COMMA | {"current": -1.0}, "current must be"),
+    (table, "comma.csv", COMMA | {"unit": "mV"}, "unit must be a number in V.*got 'mV'")])
+def test_invalid_files_are_rejected(tmp_path, content, name, options, message):
     path = tmp_path / name
-    if isinstance(content, bytes):
+    if content is table:
+        table(path, decimal=",", separator=";")
+    elif isinstance(content, bytes):
         path.write_bytes(content)
     elif content:
         savemat(path, content)
     with pytest.raises(ValueError, match=message):
-        read(path, format)
+        read(path, **options)
 
 
 @pytest.mark.parametrize(("case", "shape"), [
@@ -251,23 +263,3 @@ def test_sciospec_header_is_heeded(tmp_path):
     file.write_text("\n".join(lines))
     with pytest.raises(ValueError, match="measurement mode 1"):
         read(file)
-
-
-def test_variables_of_matlab_files(tmp_path):
-    """Names of an EIDORS file's variables; sparse arrays; types that hold no numbers."""
-    frames = np.random.default_rng(1).uniform(1, 2, (256, 3))
-    savemat(tmp_path / "a.mat", {"mine": frames, "water": frames[:, :1], "text": "abc",
-                                 "cell": np.array([1, "a"], object)})
-    measurements = read(tmp_path / "a.mat", name="mine", reference="water")
-    assert measurements.voltages.shape == (48, 16)
-    assert measurements.reference.shape == (1, 16, 16)
-    with pytest.raises(ValueError, match="one of mine, water"):
-        read(tmp_path / "a.mat")
-    for name, kind in (("text", "character array"), ("cell", "cell array")):
-        with pytest.raises(ValueError, match=f"{name} must be a numeric array, got a {kind}"):
-            read(tmp_path / "a.mat", name=name)
-    with pytest.raises(ValueError, match="must be among name, reference, got colour"):
-        read(tmp_path / "a.mat", colour=1)
-    patterns = {"Inj": csc_array(1e3 * CURRENTS.T), "Mpat": csc_array(MATRIX.T)}
-    savemat(tmp_path / "data1.mat", patterns | {"Uel": VALUES.reshape(-1, 1)})
-    np.testing.assert_allclose(read(tmp_path / "data1.mat").currents, CURRENTS, atol=1e-15)

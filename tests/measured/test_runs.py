@@ -1,5 +1,7 @@
 """Methods on measurements: predictions, inclusions, velocities, electrode residuals, and the command `estimate`."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import yaml
@@ -40,9 +42,8 @@ def test_a_failing_contact_is_visible():
     intact = moving(frames=7, amplitude=0.0)
     broken = moving(frames=7, amplitude=0.0, bad_contact=30.0)
     voltages = np.where(np.arange(56)[:, None] < 32, intact.voltages, broken.voltages)
-    measurements = Measurements(intact.currents, intact.injection_index, intact.matrix, voltages, intact.times,
-                                intact.reference)
-    run = run_on_measurements(MeasuredEnv(measurements, VESSEL, **FIXED_STDS), "log_walk_filter")
+    env = MeasuredEnv(replace(intact, voltages=voltages), VESSEL, **FIXED_STDS)
+    run = run_on_measurements(env, "log_walk_filter")
     np.testing.assert_allclose(run.frame_times, 0.08 * np.arange(7))
     before, after = run.electrode_residual_rms[1:4].max(axis=0), run.electrode_residual_rms[5:].min(axis=0)
     assert after[3] > 3 * before.max()
@@ -75,8 +76,7 @@ def pipe():
     electrodes = env.world.vessel.electrode_model(fine=True)
     empty = episode.currents @ electrodes.transfer_resistance(np.full(electrodes.mesh.n_nodes, 0.3))
     noise = env.task.noise.std(empty) * np.random.default_rng(0).normal(size=(3, *empty.shape))
-    return Measurements(episode.currents, episode.injection_index, episode.matrix, episode.voltages, episode.times,
-                        empty + noise, episode.source)
+    return replace(episode, reference=empty + noise)
 
 
 def test_a_filter_with_the_flow_predicts_better(pipe):

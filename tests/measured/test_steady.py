@@ -5,11 +5,13 @@ import pytest
 from eitbench.bench.runner import run_on_measurements
 from eitbench.envs.measured import MeasuredEnv
 from eitbench.estimation.walk import matern32_transition, matern_modes
-from tanks import FIXED_STDS, VESSEL, moving
+from tanks import VESSEL, moving
 
 
 def test_correlation_is_matern():
-    """The correlation is (1 + λτ) e^−λτ; short steps compose to a long step, and the variance is stationary."""
+    """The correlation is (1 + λτ) e^−λτ; short steps compose to a long step, and the variance is
+    stationary. Q is ∫ e^Fs L Lᵀ e^Fᵀs ds of dx = F x dt + L dw, with λ = 1 and a spectral density
+    of 4."""
     for phase in (0.1, 1.0, 4.0):
         A, Q = matern32_transition(phase)
         assert A[0, 0] == pytest.approx((1 + phase) * np.exp(-phase))
@@ -17,10 +19,6 @@ def test_correlation_is_matern():
         assert np.linalg.eigvalsh(Q).min() > -1e-15
         short, _ = matern32_transition(phase / 8)
         np.testing.assert_allclose(np.linalg.matrix_power(short, 8), A, atol=1e-12)
-
-
-def test_process_noise_is_integrated_white_noise():
-    """Q is ∫ e^Fs L Lᵀ e^Fᵀs ds of dx = F x dt + L dw, with λ = 1 and a spectral density of 4."""
     phase = 0.7
     s = (np.arange(20_000) + 0.5) / 20_000 * phase
     responses = np.array([matern32_transition(each)[0] @ [0.0, 1.0] for each in s])
@@ -28,9 +26,8 @@ def test_process_noise_is_integrated_white_noise():
                                rtol=1e-6, atol=1e-9)
 
 
-def test_modes_reproduce_the_covariance_of_the_field():
+def test_modes_reproduce_the_covariance_of_the_field(env):
     """The residual is at most a thousandth of the variance of the strongest mode."""
-    env = MeasuredEnv(moving(frames=3), VESSEL, **FIXED_STDS)
     walk = env.task.transport
     modes = matern_modes(walk.mesh, walk.length)
     strongest = (modes**2).sum(axis=0).max()
@@ -39,9 +36,9 @@ def test_modes_reproduce_the_covariance_of_the_field():
     assert residual.max() <= 1.001e-3 * strongest
 
 
-def test_smooth_motion_predicts_better_than_a_random_walk():
+def test_smooth_motion_predicts_better_than_a_random_walk(coarse):
     """The withheld RMSE is at least a tenth smaller for an inclusion that moves half round a tank in 12 frames."""
     env = MeasuredEnv(moving(frames=12), VESSEL, withheld=0.15)
     random_walk, smooth_motion = (run_on_measurements(env, name).withheld_rmse
-                        for name in ("log_walk_filter", "log_steady_filter"))
+                                  for name in ("log_walk_filter", "log_steady_filter"))
     assert smooth_motion < 0.9 * random_walk

@@ -44,22 +44,6 @@ def inverses(system: Condensation, values: np.ndarray) -> np.ndarray:
                            for k in range(0, values.shape[1], system.batch)])
 
 
-@pytest.mark.parametrize(("n", "n_ports"), [(5, 1), (30, 3), (180, 15), (200, 17)])
-def test_dense_inverse(n, n_ports):
-    """The ports' block and columns of K⁻¹ equal the dense inverse, for one matrix and for many."""
-    pattern = random_pattern(n, n_ports, seed=n)
-    system = Condensation(pattern, n_ports)
-    matrices = random_matrices(pattern, 11, seed=n + 1)
-    values = np.stack([K[system.rows, system.columns] for K in matrices], axis=1)
-    exact = np.linalg.inv(np.array(matrices))
-    tiny = 1e-12 * exact.max()
-    assert_allclose(inverses(system, values), exact[:, -n_ports:, -n_ports:], rtol=0, atol=tiny)
-    for column, inverse in zip(values.T, exact, strict=True):
-        block = inverse[-n_ports:, -n_ports:]
-        assert_allclose(system.port_inverse(column), block, rtol=0, atol=tiny)
-        assert_allclose(system.port_columns(column), inverse[:, -n_ports:], rtol=0, atol=tiny)
-
-
 def box_pattern(shape, n_ports):
     """Return a 3D grid with 27-point stencils and its coordinates; the ports, which are last, touch its end."""
     grid = np.meshgrid(*map(np.arange, shape), indexing="ij")
@@ -73,32 +57,29 @@ def box_pattern(shape, n_ports):
     return sp.csc_array(full), places
 
 
-@pytest.mark.parametrize("shape", [(4, 4, 30), (9, 9, 9), (1, 1, 5)])
-def test_nested_dissection(shape):
-    """Block and columns equal the dense inverse also with nested dissection."""
-    pattern, places = box_pattern(shape, 2)
-    system = Condensation(pattern, 2, places)
-    (matrix,) = random_matrices(pattern, 1, seed=1)
-    exact = np.linalg.inv(matrix)
-    values = matrix[system.rows, system.columns]
-    assert_allclose(system.port_inverse(values), exact[-2:, -2:], rtol=0, atol=1e-12 * exact.max())
-    assert_allclose(system.port_columns(values), exact[:, -2:], rtol=0, atol=1e-12 * exact.max())
+@pytest.mark.parametrize(("pattern", "n_ports", "places"), [
+    *((random_pattern(n, m, seed=n), m, None) for n, m in ((5, 1), (30, 3), (180, 15), (200, 17))),
+    *((pattern, 2, places) for pattern, places in
+      (box_pattern(shape, 2) for shape in ((4, 4, 30), (9, 9, 9), (1, 1, 5)))),
+], ids=["5", "30", "180", "200", "long box", "cube", "line"])
+def test_dense_inverse(pattern, n_ports, places):
+    """The ports' block and columns of K⁻¹ equal the dense inverse, for one matrix and for many,
+    also with nested dissection."""
+    system = Condensation(pattern, n_ports, places)
+    matrices = random_matrices(pattern, 11 if places is None else 1, seed=6)
+    values = np.stack([K[system.rows, system.columns] for K in matrices], axis=1)
+    exact = np.linalg.inv(np.array(matrices))
+    tiny = 1e-12 * exact.max()
+    assert_allclose(inverses(system, values), exact[:, -n_ports:, -n_ports:], rtol=0, atol=tiny)
+    for column, inverse in zip(values.T, exact, strict=True):
+        block = inverse[-n_ports:, -n_ports:]
+        assert_allclose(system.port_inverse(column), block, rtol=0, atol=tiny)
+        assert_allclose(system.port_columns(column), inverse[:, -n_ports:], rtol=0, atol=tiny)
 
 
-def test_wide_fronts_are_taken_one_by_one(monkeypatch):
-    """If eight matrices do not fit into the caches, each is factorised alone, with the same accuracy."""
-    pattern = random_pattern(180, 7, seed=2)
-    system = Condensation(pattern, 7)
-    values = np.stack([K[system.rows, system.columns] for K in random_matrices(pattern, 3, seed=5)], axis=1)
-    together = inverses(system, values)
-    monkeypatch.setattr(condensation, "_WIDEST", 0)
-    alone = Condensation(pattern, 7)
-    assert alone.batch == 1
-    assert_allclose(inverses(alone, values), together, rtol=1e-12, atol=0)
-
-
-def test_a_state_keeps_its_bits_wherever_it_stands_in_a_batch():
-    """Lanes are independent, and a batch of any length gives the same numbers."""
+def test_a_state_keeps_its_bits_wherever_it_stands_in_a_batch(monkeypatch):
+    """Lanes are independent, and a batch of any length gives the same numbers. If eight matrices do
+    not fit into the caches, each is factorised alone, with the same accuracy."""
     pattern = random_pattern(200, 6, seed=4)
     system = Condensation(pattern, 6)
     values = np.stack([K[system.rows, system.columns] for K in random_matrices(pattern, 20, seed=5)], axis=1)
@@ -107,25 +88,25 @@ def test_a_state_keeps_its_bits_wherever_it_stands_in_a_batch():
     assert_array_equal(whole, backwards)
     assert_array_equal(system.port_inverse(values[:, :3]), whole[:3])
     assert_array_equal(system.port_inverse(values[:, 13:14]), whole[13:14])
+    monkeypatch.setattr(condensation, "_WIDEST", 0)
+    alone = Condensation(pattern, 6)
+    assert alone.batch == 1
+    assert_allclose(inverses(alone, values), whole, rtol=1e-12, atol=0)
 
 
 def test_systems_and_threads_do_not_disturb_each_other():
     """Working memory is shared by all systems of a thread, but not between threads."""
-    systems = []
-    values = []
-    alone = []
+    systems, values = [], []
     for k, n in enumerate((60, 200, 150)):
         pattern = random_pattern(n, 5, seed=k)
-        system = Condensation(pattern, 5)
-        K, = random_matrices(pattern, 1, seed=k)
-        systems.append(system)
-        values.append(K[system.rows, system.columns])
-        alone.append(system.port_columns(values[-1]))
+        systems.append(Condensation(pattern, 5))
+        (K,) = random_matrices(pattern, 1, seed=k)
+        values.append(K[systems[-1].rows, systems[-1].columns])
+    alone = [system.port_columns(each) for system, each in zip(systems, values, strict=True)]
     jobs = [k % 3 for k in range(120)]
     with ThreadPoolExecutor(4) as pool:
         together = list(pool.map(lambda k: systems[k].port_columns(values[k]), jobs))
-    for k, columns in zip(jobs, together, strict=True):
-        assert_array_equal(columns, alone[k])
+    np.testing.assert_equal(together, [alone[k] for k in jobs])
 
 
 def test_numba_that_does_not_work_is_named(monkeypatch):

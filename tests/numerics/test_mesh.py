@@ -31,22 +31,25 @@ def facet_sizes(mesh: Mesh) -> np.ndarray:
     return 0.5 * np.linalg.norm(np.cross(edge[:, 0], edge[:, 1]), axis=1)
 
 
-# -- cells and facets -------------------------------------------------------------------------------------------------
-
 @in_both_dimensions
 def test_volumes(dim):
-    """The cells fill the box; volumes agree with the mass matrix."""
+    """The cells fill the box; volumes agree with the mass matrix; uᵀKu = |g|²·volume for u = g·x
+    and the P1 stiffness matrix K, which integrates gradients."""
     mesh = MESHES[dim]
     assert mesh.dim == dim and mesh.volumes.shape == (len(mesh.cells),) and (mesh.volumes > 0).all()
     assert_allclose(mesh.volumes.sum(), SIZE[:dim].prod(), rtol=1e-13)
     # Row sums of the mass matrix are the nodes' shares ∫φ_i of the volumes.
     share = np.bincount(mesh.cells.ravel(), np.repeat(mesh.volumes, dim + 1)) / (dim + 1)
     assert_allclose(np.asarray(mass_matrix(mesh).sum(axis=1)), share, rtol=1e-12)
+    g = np.array([2.0, -1.0, 0.5])[:dim]
+    u = mesh.points @ g
+    assert_allclose(u @ stiffness_matrix(mesh) @ u, g @ g * SIZE[:dim].prod(), rtol=1e-12)
 
 
 @in_both_dimensions
 def test_boundary_facets(dim):
-    """The boundary has the facets and the size of the box's sides; all its facets lie on a side."""
+    """The boundary has the facets and the size of the box's sides; all its facets lie on a side. A
+    side is found by its coordinate, with its full size; a point on the boundary has no facet."""
     mesh = MESHES[dim]
     count, size = (2 * (6 + 5), 2 * (1.0 + 0.8)) if dim == 2 else (
         2 * 2 * (3 * 4 + 4 * 3 + 3 * 3), 2 * (1.0 * 0.8 + 0.8 * 0.6 + 0.6 * 1.0))
@@ -56,12 +59,6 @@ def test_boundary_facets(dim):
     corner = mesh.points[facets]
     on_side = (np.abs(corner) < 1e-12).all(axis=1) | (np.abs(corner - SIZE[:dim]) < 1e-12).all(axis=1)
     assert on_side.any(axis=1).all()
-
-
-@in_both_dimensions
-def test_facets_where(dim):
-    """A side is found by its coordinate, with its full size; a point on the boundary has no facet."""
-    mesh = MESHES[dim]
     top = mesh.facets_where(lambda p: p[:, dim - 1] > SIZE[dim - 1] - 1e-9)
     assert len(top) == (6 if dim == 2 else 2 * 3 * 4)
     assert_allclose(mesh.points[top][:, :, dim - 1], SIZE[dim - 1])
@@ -81,17 +78,6 @@ def test_orientation_does_not_matter(dim):
     assert_allclose(turned.interpolation_to(points).toarray(), mesh.interpolation_to(points).toarray(), atol=1e-12)
     assert_allclose(stiffness_matrix(turned).toarray(), stiffness_matrix(mesh).toarray(), atol=1e-12)
 
-
-@in_both_dimensions
-def test_stiffness_of_a_linear_function(dim):
-    """uᵀKu = |g|²·volume for u = g·x: the P1 stiffness matrix integrates gradients."""
-    mesh = MESHES[dim]
-    g = np.array([2.0, -1.0, 0.5])[:dim]
-    u = mesh.points @ g
-    assert_allclose(u @ stiffness_matrix(mesh) @ u, g @ g * SIZE[:dim].prod(), rtol=1e-12)
-
-
-# -- interpolation ----------------------------------------------------------------------------------------------------
 
 @settings(max_examples=40)
 @given(dim=st.sampled_from([2, 3]), seed=st.integers(0, 2**32 - 1), candidates=st.sampled_from([1, 4, 32]),
@@ -133,8 +119,6 @@ def test_points_outside_are_located_at_the_nearest_wall(dim):
     for cell, weights in zip(mesh.cells[cells], barycentric, strict=True):
         assert any(weights[i] == 0 and tuple(np.sort(np.delete(cell, i))) in walls for i in range(dim + 1))
 
-
-# -- structured meshes ------------------------------------------------------------------------------------------------
 
 def test_rectangle_mesh_is_numbered_by_cross_section():
     """Nodes run up the first cross-section, then the next; matrices have half-bandwidth len(y) + 1."""
@@ -187,8 +171,6 @@ def test_graded_pipe_mesh():
     for i in place:
         assert size[i] < 0.3 * size[i + 2] and size[i - 1] < 0.3 * size[i - 3]
 
-
-# -- errors -----------------------------------------------------------------------------------------------------------
 
 @pytest.mark.parametrize(("points", "cells", "match"), [
     (TRIANGLE[:, :1], [[0, 1]], r"points must have shape \(n_nodes, 2\) or \(n_nodes, 3\)"),

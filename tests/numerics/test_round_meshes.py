@@ -51,31 +51,21 @@ SECTIONS = {"rings": disc_mesh(*random_rings(np.random.default_rng(0))), "unifor
 each_section = pytest.mark.parametrize("section", SECTIONS.values(), ids=SECTIONS.keys())
 
 
-# -- discs ------------------------------------------------------------------------------------------------------------
-
 @pytest.mark.parametrize("seed", range(20))
 def test_rings_are_joined_without_gap_or_overlap(seed):
-    """Triangles fill the outer polygon, meet edge to edge, and have the outer ring's edges as their only boundary."""
+    """Triangles fill the outer polygon, meet edge to edge, and have the outer ring's edges as their
+    only boundary. Node 0 is the centre, followed by the rings in the order of their angles."""
     radii, rings = random_rings(np.random.default_rng(seed))
     mesh = disc_mesh(radii, rings)
+    on_rings = [r * np.exp(1j * ring) for r, ring in zip(radii, rings, strict=True)]
+    assert_allclose(mesh.points @ [1, 1j], np.concatenate([[0.0], *on_rings]), atol=1e-15)
     n = len(rings[-1])
-    assert mesh.n_nodes == 1 + sum(map(len, rings))
     assert_allclose(mesh.volumes.sum(), polygon_area(mesh.points[-n:]), rtol=1e-13)
     edges, count = facet_counts(mesh)
     assert count.max() == 2
     assert mesh.n_nodes - len(edges) + len(mesh.cells) == 1                            # Euler: one piece, no hole
     wall = mesh.n_nodes - n + np.arange(n)
     assert_array_equal(mesh.boundary_facets, np.unique(np.sort([wall, np.roll(wall, -1)], axis=0).T, axis=0))
-
-
-def test_nodes_are_numbered_from_the_centre_outwards():
-    """Node 0 is the centre, followed by the rings in the order of their angles."""
-    radii, rings = random_rings(np.random.default_rng(1))
-    points = disc_mesh(radii, rings).points
-    assert_array_equal(points[0], 0.0)
-    assert_allclose(np.linalg.norm(points[1:], axis=1), np.repeat(radii, list(map(len, rings))))
-    assert_allclose(points[1:, 0] + 1j * points[1:, 1], np.concatenate(
-        [r * np.exp(1j * ring) for r, ring in zip(radii, rings, strict=True)]), atol=1e-15)
 
 
 @pytest.mark.parametrize("rings", [1, 4, 9])
@@ -107,28 +97,22 @@ def test_electrode_disc(spans, cells, rings, smallest):
     assert angles_of(mesh).min() > smallest
 
 
-# -- extruded bodies --------------------------------------------------------------------------------------------------
-
-@each_section
-def test_nodes_are_numbered_by_section(section):
-    """The nodes at every z are the section's, in its order; a cell's nodes are in two neighbouring sections."""
-    body = extrude(section, Z)
-    points = body.points.reshape(len(Z), section.n_nodes, 3)
-    assert_array_equal(points[:, :, :2], np.broadcast_to(section.points, (len(Z), *section.points.shape)))
-    assert_array_equal(points[:, :, 2], np.broadcast_to(Z[:, None], points.shape[:2]))
-    layers = body.cells // section.n_nodes
-    assert_array_equal(np.ptp(layers, axis=1), 1)
-    within = body.cells % section.n_nodes                                              # each lies above one triangle
-    assert {tuple(np.unique(cell)) for cell in within} == {tuple(cell) for cell in np.sort(section.cells, axis=1)}
-
-
 @each_section
 def test_prisms_are_filled_and_neighbours_agree(section):
-    """Three tetrahedra of one volume a prism; every facet inside has two cells; outside are two ends and the sides."""
+    """The nodes at every z are the section's, in its order. Three tetrahedra of one volume fill a
+    prism, with nodes in two neighbouring sections; every facet inside has two cells; outside are
+    two ends and the
+    sides."""
     # Renumbered at random: the diagonals must fit together however the section is numbered.
     place = np.random.default_rng(2).permutation(section.n_nodes)
     section = Mesh(section.points[np.argsort(place)], place[section.cells])
     body = extrude(section, Z)
+    points = body.points.reshape(len(Z), section.n_nodes, 3)
+    assert_array_equal(points[:, :, :2], np.broadcast_to(section.points, (len(Z), *section.points.shape)))
+    assert_array_equal(points[:, :, 2], np.broadcast_to(Z[:, None], points.shape[:2]))
+    assert_array_equal(np.ptp(body.cells // section.n_nodes, axis=1), 1)
+    within = body.cells % section.n_nodes                                              # each lies above one triangle
+    assert {tuple(np.unique(cell)) for cell in within} == {tuple(cell) for cell in np.sort(section.cells, axis=1)}
     volumes = body.volumes.reshape(len(Z) - 1, len(section.cells), 3)
     prisms = np.diff(Z)[:, None, None] * section.volumes[:, None]
     assert_allclose(volumes, np.broadcast_to(prisms / 3, volumes.shape), rtol=1e-9)
@@ -171,8 +155,6 @@ def test_round_pipe_mesh():
     chords = 2 * R * np.sin(np.diff(graded_interval(*SPANS[2], 3, 2.0)) / 2)
     assert_allclose(area.sum(), 0.04 * chords.sum(), rtol=1e-10)
 
-
-# -- errors -----------------------------------------------------------------------------------------------------------
 
 SQUARE = np.pi / 2 * np.arange(4)
 

@@ -1,4 +1,4 @@
-"""Flow of solute through the outlet of a pipe: analytic values, and balance with the inflow."""
+"""Flow of solute through the outlet of a pipe: analytic values."""
 
 import eitbench
 import numpy as np
@@ -12,20 +12,20 @@ from eitbench.worlds import entry
 R, V = 0.05, 4.5
 
 
-@pytest.mark.parametrize(("name", "area"), [("Pipe2D", 2 * R), ("Pipe2DObstacle", 2 * R)])
-def test_a_homogeneous_fluid_leaves_at_the_volumetric_flow(name, area):
-    """∫ c v·n = c v̄ A."""
-    transport = eitbench.make_task(entry(f"eitbench/{name}-v0").world).transport
-    flow = outlet_of(transport).solute_flow(np.full(transport.mesh.n_nodes, 30.0), transport.velocity)
-    assert flow == pytest.approx(30.0 * V * area, rel=1e-9)
-
-
-def test_a_round_pipe():
-    """∫ c v·n = c v̄ π R² up to the polygon of the mesh."""
+def round_pipe():
     mesh = extrude(uniform_disc(R, 6), np.linspace(0.0, 0.1, 4))
-    transport = ConvectionDiffusion(mesh, RoundPipeFlow(V, R), 5e-4, 5e-3)
-    flow = outlet_of(transport).solute_flow(np.full(mesh.n_nodes, 30.0), transport.velocity)
-    assert flow == pytest.approx(30.0 * V * np.pi * R**2, rel=0.05)
+    return ConvectionDiffusion(mesh, RoundPipeFlow(V, R), 5e-4, 5e-3)
+
+
+@pytest.mark.parametrize(("name", "area", "tolerance"), [
+    ("Pipe2D", 2 * R, 1e-9), ("Pipe2DObstacle", 2 * R, 1e-9), ("round", np.pi * R**2, 0.05)])
+def test_a_homogeneous_fluid_leaves_at_the_volumetric_flow(name, area, tolerance):
+    """∫ c v·n = c v̄ A, in a round pipe up to the polygon of the mesh."""
+    transport = (round_pipe() if name == "round" else
+                 eitbench.make_task(entry(f"eitbench/{name}-v0").world).transport)
+    c = np.full(transport.mesh.n_nodes, 30.0)
+    flow = outlet_of(transport).solute_flow(c, transport.velocity)
+    assert flow == pytest.approx(30.0 * V * area, rel=tolerance)
 
 
 def test_a_profile_across_the_pipe():
@@ -39,13 +39,3 @@ def test_a_profile_across_the_pipe():
 
     expected = 1.5 * V * R * (2 * 4 / 3 + 4 / 15)            # ∫(1 − η²)(1 + η)(2 + η) dη from −1 to 1
     assert outlet_of(transport).solute_flow(2.0 + y / R, skewed) == pytest.approx(expected, rel=1e-4)
-
-
-def test_what_enters_leaves():
-    """After the transit time the outlet has the flow of a constant inflow."""
-    transport = eitbench.make_task(entry("eitbench/Pipe2D-v0").world).transport
-    c = np.full(transport.mesh.n_nodes, 30.0)
-    for _ in range(200):
-        c = transport.step(c, 36.0, 36.0)
-    outlet = outlet_of(transport)
-    assert outlet.solute_flow(c, transport.velocity) == pytest.approx(36.0 * V * 2 * R, rel=2e-3)

@@ -8,8 +8,6 @@ from eitbench.physics.transport import ConvectionDiffusion
 
 from shapes import box_mesh
 
-# -- helpers ----------------------------------------------------------------------------------------------------------
-
 CHANNEL = rectangle_mesh(np.linspace(0.0, 1.0, 13), np.linspace(-0.25, 0.25, 7))
 INLET = np.arange(7)
 
@@ -77,42 +75,38 @@ def assert_derivatives(velocity, directions, state, tolerance=1e-8, **settings):
         np.testing.assert_allclose(derivative, reference, atol=tolerance * np.abs(reference).max())
 
 
-# -- against differences ----------------------------------------------------------------------------------------------
+def bent(mean, size):
+    """Return a flow in three dimensions."""
+    return lambda points: np.array(mean) + np.sin(points[:, [1, 2, 0]]) * size
 
 
-@pytest.mark.parametrize(("speed", "changes"), [
-    (1.0, {}), (1.0, {"substeps": 1}), (1.0, {"diffusivity": 1e-9}), (1.0, {"diffusivity": 0.5}),
-    (1e-3, {"diffusivity": 0.5}),
-], ids=["mild", "one sub-step", "convective", "diffusive", "creeping"])
-def test_derivatives_in_the_channel(speed, changes):
-    """Derivatives along three axial profiles from a skew base flow equal central differences to 1e-8.
+def skewed(speed):
+    return moved(PlaneChannelFlow(speed, 0.25), SKEW, 0.7 * speed)
+
+
+OBLIQUE = moved(lambda points: np.full_like(points, [1.0, 0.37]), eddy, 0.1)
+AXIAL = [PARABOLA, SKEW, FLAT]
+
+
+@pytest.mark.parametrize(("flow", "directions", "changes", "tolerance"), [
+    (skewed(1.0), AXIAL, {}, 1e-8), (skewed(1.0), AXIAL, {"substeps": 1}, 1e-8),
+    (skewed(1.0), AXIAL, {"diffusivity": 1e-9}, 1e-8),
+    (skewed(1.0), AXIAL, {"diffusivity": 0.5}, 1e-8),
+    (skewed(1e-3), AXIAL, {"diffusivity": 0.5}, 1e-8), (OBLIQUE, [eddy, PARABOLA], {}, 1e-8),
+    (half, [half, PARABOLA, SKEW], {}, 1e-6), (still, [half, PARABOLA, eddy], {}, 1e-6),
+    (bent([1.0, 0.3, 0.2], 0.2), [bent([0.2, -0.5, 0.4], 1.0)],
+     {"mesh": box(), "inlet": np.arange(15)}, 1e-8),
+], ids=["mild", "one sub-step", "convective", "diffusive", "creeping", "oblique", "partly at rest",
+        "at rest", "tetrahedra"])
+def test_derivatives_are_those_of_steps(flow, directions, changes, tolerance):
+    """Derivatives equal central differences: along axial profiles from a skew base flow, in a flow
+    oblique to all cells, without a flow in half of the channel, or anywhere, where they follow the
+    scheme along each direction, and in a deformed cube.
 
     Cell Péclet numbers are up to 17, to 7e7, and to 0.1 and 1e-4 with dominant diffusion.
     """
-    base = moved(PlaneChannelFlow(speed, 0.25), SKEW, 0.7 * speed)
-    assert_derivatives(base, [PARABOLA, SKEW, FLAT], random_state(np.random.default_rng(0)), **changes)
-
-
-def test_derivatives_in_a_flow_of_any_direction():
-    """Derivatives for a flow and directions oblique to all cells equal central differences to 1e-8."""
-    flow = moved(lambda points: np.full_like(points, [1.0, 0.37]), eddy, 0.1)
-    assert_derivatives(flow, [eddy, PARABOLA], random_state(np.random.default_rng(1)))
-
-
-def test_derivatives_on_tetrahedra():
-    """Derivatives in a deformed cube, in three dimensions."""
-    mesh = box()
-    inlet = np.flatnonzero(np.arange(60) < 15)
-    flow, other = (lambda points, a=a, b=b: np.array(a) + np.sin(points[:, [1, 2, 0]]) * b
-                   for a, b in (([1.0, 0.3, 0.2], 0.2), ([0.2, -0.5, 0.4], 1.0)))
-    assert_derivatives(flow, [other], random_state(np.random.default_rng(2), 60, 15), mesh=mesh, inlet=inlet)
-
-
-def test_derivatives_where_the_fluid_stands_still():
-    """Without a flow in half of the channel, or anywhere, derivatives follow the scheme along each direction."""
-    state = random_state(np.random.default_rng(3))
-    for flow, directions in ((half, [half, PARABOLA, SKEW]), (still, [half, PARABOLA, eddy])):
-        assert_derivatives(flow, directions, state, tolerance=1e-6)
+    state = random_state(np.random.default_rng(0), *((60, 15) if "mesh" in changes else (91, 7)))
+    assert_derivatives(flow, directions, state, tolerance, **changes)
 
 
 def test_a_kink_counts_half_from_either_side():
@@ -130,39 +124,17 @@ def test_a_kink_counts_half_from_either_side():
     np.testing.assert_allclose(derivative, 0.5 * (up + down), atol=1e-4 * scale)
 
 
-# -- properties -------------------------------------------------------------------------------------------------------
-
-
-def test_derivatives_at_the_inlet_are_zero():
-    """The inflow is prescribed for any velocity; inlet values of c are ignored."""
-    cd, (c, before, after) = build(eddy), random_state(np.random.default_rng(6))
-    _, derivatives = cd.velocity_derivatives(c, before, after, [PARABOLA])
-    np.testing.assert_array_equal(derivatives[INLET], 0.0)
-    assert (derivatives[7:] != 0.0).all()
-    c[INLET] = 1e3
-    np.testing.assert_array_equal(cd.velocity_derivatives(c, before, after, [PARABOLA])[1], derivatives)
-
-
-def test_transition_is_that_of_the_evolution_model():
-    """F and Y are the same with and without H, in either order."""
-    first, second = build(eddy), build(eddy)
-    F, Y = first.transition()
-    for model in (first.evolution_model(), second.evolution_model()):
-        np.testing.assert_array_equal(model.F, F)
-        np.testing.assert_array_equal(model.Y, Y)
-    np.testing.assert_array_equal(second.transition()[0], F)
-    assert first.evolution_model().F is F
-
-
-@pytest.mark.parametrize(("c", "before", "after", "directions", "name"), [
-    (np.zeros(90), 0.0, 0.0, [PARABOLA], "^c "), (np.zeros((91, 2)), 0.0, 0.0, [PARABOLA], "^c "),
-    (np.full(91, np.nan), 0.0, 0.0, [PARABOLA], "^c "), (np.zeros(91), np.zeros(6), 0.0, [PARABOLA], "inflow_before"),
-    (np.zeros(91), 0.0, np.zeros((7, 2)), [PARABOLA], "inflow_after"),
-    (np.zeros(91), 0.0, 0.0, [PARABOLA, lambda points: points[:, 0]], r"directions\[1\]"),
-    (np.zeros(91), 0.0, 0.0, [lambda points: points * np.nan], r"directions\[0\]"),
-    (np.zeros(91), 0.0, 0.0, [], "^directions"),
+@pytest.mark.parametrize(("changes", "name"), [
+    ({"c": np.zeros(90)}, "^c "), ({"c": np.zeros((91, 2))}, "^c "),
+    ({"c": np.full(91, np.nan)}, "^c "),
+    ({"inflow_before": np.zeros(6)}, "inflow_before"),
+    ({"inflow_after": np.zeros((7, 2))}, "inflow_after"),
+    ({"directions": [PARABOLA, lambda points: points[:, 0]]}, r"directions\[1\]"),
+    ({"directions": [lambda points: points * np.nan]}, r"directions\[0\]"),
+    ({"directions": []}, "^directions"),
 ])
-def test_errors_name_the_argument(c, before, after, directions, name):
+def test_errors_name_the_argument(changes, name):
     """States, inflows and directions of the wrong shape, or not finite, are rejected by name."""
+    state = {"c": np.zeros(91), "inflow_before": 0.0, "inflow_after": 0.0}
     with pytest.raises(ValueError, match=name):
-        build(eddy).velocity_derivatives(c, before, after, directions)
+        build(eddy).velocity_derivatives(**state | {"directions": [PARABOLA]} | changes)

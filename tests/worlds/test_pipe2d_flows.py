@@ -1,7 +1,5 @@
 """Flows that are drawn for each episode: their distributions and the transport by them."""
 
-from functools import cache
-
 import numpy as np
 import pytest
 from eitbench.data.episodes import cached_truth_model
@@ -21,13 +19,6 @@ each_unknown = pytest.mark.parametrize("world", WORLDS[1:], ids=lambda world: wo
 def drawn(world, seed):
     """Return the flow of an episode."""
     return world.flow.draw(world, episode_streams(seed).flow)
-
-
-@cache
-def truth_of(world):
-    """Return the truth of a short episode of a world with seed 7, simulated alone."""
-    (truth,) = truths(world.with_changes(DRAWN), 7)
-    return truth
 
 
 def mean_velocities(world, seeds):
@@ -119,10 +110,12 @@ def test_slowest_fluid_flushes_the_pipe_before_the_start():
 @each_unknown
 def test_recorded_flow_is_the_drawn_one(world):
     """`TruthTrajectory.velocity` is the profile at `VelocityModel.points` in the middle of each step, with the drawn
-    mean."""
-    velocity = truth_of(world).velocity
+    mean. Episodes with different flows are simulated together with the same bits as alone."""
     world = world.with_changes(DRAWN)
-    model = world.velocity_model
+    (truth,), (other, again) = truths(world, 7), truths(world, 8, 7)
+    assert [array.tobytes() for array in truth] == [array.tobytes() for array in again]
+    assert np.abs(truth.concentration - other.concentration).max() > 0.1
+    velocity, model = truth.velocity, world.velocity_model
     assert velocity.shape == (5, 24)
     flow = drawn(world, 7)
     for t in range(1, 6):
@@ -138,7 +131,8 @@ def test_recorded_flow_is_the_drawn_one(world):
 
 def test_recorded_flow_is_the_one_that_carries():
     """The truth's two transport steps with the cached mean velocity give the next cached state to rounding."""
-    history, world = truth_of(PIPE_2D_TIME_VARYING), PIPE_2D_TIME_VARYING.with_changes(DRAWN)
+    world = PIPE_2D_TIME_VARYING.with_changes(DRAWN)
+    (history,) = truths(world, 7)
     half_width = world.vessel.half_width
     truth = cached_truth_model(world)
     inflow = world.target.draw_inflow(world, episode_streams(7).inflow)
@@ -164,11 +158,3 @@ def test_a_reference_is_given_the_flow_that_carries(world):
     for t in (1, 2, 5):
         real = model.transport.with_velocity(flow(t))
         np.testing.assert_array_equal(transport_at(t).step(c, 30.0, 31.0), real.step(c, 30.0, 31.0))
-
-
-def test_simulated_together_same_bits():
-    """Episodes with different flows are simulated one by one, with the same results as alone."""
-    other, one = truths(PIPE_2D_TIME_VARYING.with_changes(DRAWN), 8, 7)
-    alone = truth_of(PIPE_2D_TIME_VARYING)
-    assert [array.tobytes() for array in one] == [array.tobytes() for array in alone]
-    assert np.abs(one.concentration - other.concentration).max() > 0.1

@@ -1,7 +1,5 @@
 """Third-party worlds, registered by a script or by the entry points of a package."""
 
-import pickle
-import subprocess
 import sys
 from dataclasses import dataclass, replace
 from importlib.metadata import EntryPoint
@@ -114,27 +112,6 @@ def test_an_id_that_nobody_registered_is_named():
     """The message lists the most similar ids."""
     with pytest.raises(ValueError, match=r"env must be one of eitbench/.*, … \([0-9]+ in all\); got 'mine/"):
         entry(ID)
-
-
-def test_another_process_takes_over(tmp_path):
-    """An id of a script runs in other processes, bit-identical."""
-    world = PIPE_2D.with_changes(FAST)
-    register(world, ID, lag=2, description="Mine.", test_seeds="test:0-2")
-    path = tmp_path / "entries"
-    path.write_bytes(pickle.dumps(registry.runtime_entries()))
-    code = ("import pathlib, pickle, sys\n"
-            "import gymnasium as gym\n"
-            "from eitbench.worlds import entry, registry\n"
-            f"stored = pickle.loads(pathlib.Path({str(path)!r}).read_bytes())\n"
-            "for _ in range(2):\n"
-            "    registry.import_entries(stored)\n"
-            "assert entry(stored[0].id) == stored[0]\n"
-            "env = gym.make(stored[0].id)\n"
-            "assert env.unwrapped.lag == 2\n"
-            "print(env.reset(seed=1)[0]['voltages'].tobytes().hex())")
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    here = gym.make(ID).reset(seed=1)[0]["voltages"]
-    assert done.stdout.strip() == here.tobytes().hex()
 
 
 def test_the_last_registration_is_used():

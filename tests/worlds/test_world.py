@@ -10,6 +10,7 @@ from eitbench.worlds import entries
 from eitbench.worlds.catalogue import (
     BUBBLE_TRACKING,
     PIPE_2D,
+    PIPE_2D_TURBULENT,
     PIPE_3D,
     ROTATING_TANK_2D,
     STATIONARY_TANK_2D,
@@ -110,6 +111,10 @@ def test_every_number_can_be_named(id):
     (BUBBLE_TRACKING, {"vessel": PlanePipe(bulge=Bulge())}, "target must be in a PlanePipe without a bulge"),
     (BUBBLE_TRACKING, {"vessel": RoundTank()}, "target must be in a PlanePipe without a bulge"),
     (BUBBLE_TRACKING, {"flow": NoFlow()}, "flow must be a flow through the pipe"),
+    *((BUBBLE_TRACKING, {"target": {"n_bodies": n}},
+       f"n_bodies must be an integer of at least 1 and at most 4, got {n}") for n in (0, 5, 1.5)),
+    *((PIPE_2D_TURBULENT, {"flow": change}, next(iter(change))) for change in (
+        {"intensity": -0.1}, {"profile": "plug"}, {"n_modes": 0}, {"integral_scale": 0.0})),
 ], ids=str)
 def test_what_is_wrong_is_named(world, changes, message):
     """The message contains the part, the field, the value and the allowed range."""
