@@ -58,6 +58,7 @@ ASSUMPTIONS = {
     "identified_flow": ("identified from episodes", "fitted inflow, positive"),
     "real_time_filter": ("identified from episodes", "fitted inflow, positive"),
     "filter_bank": ("one of nine velocities", "white inflow"),
+    "cross_correlation": ("velocity by cross-correlation", "white inflow"),
     "joint_extended_kalman_filter": ("estimated parameters", "white inflow"),
     "joint_inflow_filter": ("estimated parameters", "fitted inflow, positive"),
     "ensemble_kalman_filter": ("estimated parameters", "fitted inflow, positive"),

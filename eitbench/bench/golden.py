@@ -76,7 +76,7 @@ def update(names: list[str], *, new_version: bool = False) -> Iterator[tuple[str
     files. Yield name, status (``new``, ``same``, ``moved``, or the new version) and differences.
 
     With ``new_version``, a method's file whose numbers differ is rewritten with the next version
-    number. A world's file is never changed. ``ValueError`` if a name is neither a built-in id nor a
+    number. Other files are never changed. ``ValueError`` if a name is neither a built-in id nor a
     built-in method.
     """
     known = [*tracks.builtin_ids(), *golden_methods()]
@@ -87,18 +87,10 @@ def update(names: list[str], *, new_version: bool = False) -> Iterator[tuple[str
         computed = compute(name, expected)
         moved = compare(name, computed, expected) if expected else []
         status = "moved" if moved else "same" if expected else "new"
-        is_method = "method" in computed
-        if expected and not moved and is_method:
-            # scores introduced after the file was written are added; the others stay bit for bit
-            computed = expected | {"episodes": [
-                old | {"scores": new["scores"] | old["scores"]}
-                for old, new in zip(expected["episodes"], computed["episodes"], strict=True)]}
-        elif expected and not moved:
-            computed = expected
-        elif moved and new_version and is_method:
+        if moved and new_version and "method" in computed:
             computed["version"] += 1
             status = f"v{computed['version']}"
-        if status != "moved" and computed != expected:
+        if status not in ("same", "moved"):
             write_atomically(golden_path(name), f"{json.dumps(computed, indent=1)}\n".encode())
             methods.golden_version.cache_clear()
         yield name, status, moved
