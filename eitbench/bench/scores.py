@@ -100,6 +100,9 @@ class Score:
     """Factor of displayed values: 1e3 for seconds in ms."""
     deterministic: bool = True
     """True if a rerun of the episode gives the same number; false for times."""
+    rounding: float = 0.0
+    """Difference between reruns that rounding may cause beyond a relative one: a fraction of nodes
+    changes where a node is at the end of an interval."""
 
     def __post_init__(self) -> None:
         if not self.name.isidentifier() or self.name != self.name.lower() or self.name[0] == "_":
@@ -111,6 +114,7 @@ class Score:
         for each in self.tracks:
             _check.choice("each of tracks", each, KINDS)
         _check.number("factor", self.factor, low=0.0, open_low=True)
+        _check.number("rounding", self.rounding, low=0.0)
 
     def __call__(self, outcome: Outcome) -> float | None:
         """Compute the score of an episode; None if a required field is missing or the score is
@@ -253,10 +257,10 @@ for _score in (
           lambda outcome: outcome.ospa, tracks=("injection",), factor=1e3),
     Score("coverage_50", "50 %", "fraction of the truth inside the reported 50 % interval",
           lambda outcome: scoring.coverage(*_uncertainty(outcome), 0.5),
-          direction="nominal", requires=("std",), tracks=TRACKS),
+          direction="nominal", requires=("std",), tracks=TRACKS, rounding=1e-4),
     Score("coverage_90", "90 %", "fraction of the truth inside the reported 90 % interval",
           lambda outcome: scoring.coverage(*_uncertainty(outcome), 0.9),
-          direction="nominal", requires=("std",), tracks=TRACKS),
+          direction="nominal", requires=("std",), tracks=TRACKS, rounding=1e-4),
     Score("spread_ratio", "var/MSE",
           "reported variance over mean squared error; 1 if calibrated, more if the uncertainty is "
           "overestimated",

@@ -265,20 +265,24 @@ def score_differences(recorded: dict[str, Any], result: dict[str, Any]) -> dict[
         return {"status": np.inf}
     if recorded["status"] == "failed":
         return {}
-    found = {name: _relative([value], [result["scores"].get(name)])
+    found = {name: _relative([value], [result["scores"].get(name)],
+                             known[name].rounding if name in known else 0.0)
              for name, value in sorted(recorded["scores"].items())
              if name not in known or known[name].deterministic}
     return found | {"step_errors": _relative(recorded["step_errors"], result["step_errors"])}
 
 
-def _relative(a: Sequence[float | None], b: Sequence[float | None]) -> float:
-    """Return the largest |a − b| / max(|a|, |b|); infinite if only one of a pair is a number."""
+def _relative(a: Sequence[float | None], b: Sequence[float | None],
+              rounding: float = 0.0) -> float:
+    """Return the largest |a − b| / max(|a|, |b|), without differences up to ``rounding``; infinite
+    if only one of a pair is a number."""
     first, second = np.array(a, float), np.array(b, float)
     if len(a) != len(b) or (np.isnan(first) != np.isnan(second)).any():
         return float(np.inf)
     size = np.maximum(np.abs(first), np.abs(second))
-    relative = np.abs(first - second) / np.where(size > 0.0, size, 1.0)
-    return float(np.nanmax(relative, initial=0.0))
+    difference = np.abs(first - second)
+    relative = difference / np.where(size > 0.0, size, 1.0)
+    return float(np.nanmax(np.where(difference > rounding, relative, 0.0), initial=0.0))
 
 
 # -- reports ------------------------------------------------------------------------------------
