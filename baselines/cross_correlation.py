@@ -1,4 +1,5 @@
-"""Kalman filter with the velocity of cross-correlation (Beck & Plaskowski 1987).
+"""Cross-correlation velocimetry (Beck & Plaskowski 1987), and an extended Kalman filter with its
+velocity.
 
 Images of a random walk with the correlation LENGTH and the steps STEP ĉ_bh are averaged over
 SECTIONS cross sections of the pipe. The averages of the last WINDOW time steps, without the first
