@@ -1,13 +1,13 @@
-"""Cross-correlation velocimetry (Beck & Plaskowski 1987), and an extended Kalman filter with its
-velocity.
+"""Kalman filter with the velocity of cross-correlation (Beck & Plaskowski 1987).
 
 Images of a random walk with the correlation LENGTH and the steps STEP ĉ_bh are averaged over
 SECTIONS cross sections of the pipe. The averages of the last WINDOW time steps, without the first
 SKIPPED of an episode, are correlated between sections that are GAP apart. The correlation is
 largest at the time in which fluid moves from one section to the other. The prior mean of the
 velocity is scaled so that its largest value, divided by METER_FACTOR, gives this time. The velocity
-is kept where the correlation is below MIN_CORRELATION or has no maximum within FACTORS. The
-constants were chosen on train:0-15 of Pipe2DUnknownVelocity.
+is kept where the correlation is below MIN_CORRELATION or has no maximum within FACTORS. An extended
+Kalman filter uses it as if it were exact. The constants were chosen on train:0-15 of
+Pipe2DUnknownVelocity.
 """
 
 from dataclasses import replace
@@ -33,28 +33,29 @@ STEP, INITIAL_STD = 0.005, 0.25
 SECTIONS, GAP, WINDOW = 20, 12, 48
 SKIPPED, MIN_PAIRS = 4, 6
 METER_FACTOR = 0.9
-"""Largest velocity of the profile, divided by the velocity of the correlation."""
+"""Largest velocity of the profile, relative to the velocity of the correlation, which images that
+are blurred along the pipe increase."""
 MIN_CORRELATION = 0.7
 FACTORS = np.linspace(0.4, 1.7, 66)
-"""Velocities relative to the prior mean."""
+"""Velocity relative to the prior mean."""
 
 
 class CrossCorrelationFilter:
     """Filter with a velocity from cross-correlation, for `FilterEstimator`."""
 
     def __init__(self, task: Task, c_ref: float) -> None:
-        known = task_velocity_prior(task)
-        self.velocity = self._nominal = known.initial
+        flow = task_velocity_prior(task)
+        self._nominal = self._velocity = flow.initial
         walk = RandomWalk(task.mesh, task.transport.time_step, LENGTH)
         prior = replace(task.prior, nodal_std=STEP, initial_std=INITIAL_STD, initial_length=LENGTH)
         self._images = nodal_filter(walk, prior, c_ref, linearise_at_reference(task, c_ref))
         self._sections, distance = cross_sections(task)
-        fastest = (known.profiles @ known.initial).max() / METER_FACTOR
+        fastest = (flow.profiles @ flow.initial).max() / METER_FACTOR
         self._lags = distance / (FACTORS * fastest * task.transport.time_step)
         self._averages: list[np.ndarray] = []
-        zero = np.zeros_like(known.initial)
-        flow = replace(known, initial_std=zero, walk_std=zero)
-        self._filter = Filter(VelocityStates(task, c_ref, flow), linearise_at_prediction(task))
+        zero = np.zeros_like(flow.initial)
+        exact = replace(flow, initial_std=zero, walk_std=zero)
+        self._filter = Filter(VelocityStates(task, c_ref, exact), linearise_at_prediction(task))
 
     def assimilate(self, voltages: np.ndarray, currents: np.ndarray) -> None:
         """Use a measurement vector (L,) in V and its injection (L,) in A (A/m in 2D)."""
@@ -64,8 +65,8 @@ class CrossCorrelationFilter:
         correlations = correlate(signals, GAP, self._lags)
         best = int(np.argmax(correlations))
         if correlations[best] >= MIN_CORRELATION and 0 < best < len(FACTORS) - 1:
-            self.velocity = FACTORS[best] * self._nominal
-        self._filter.mean[-len(self.velocity):] = self.velocity
+            self._velocity = FACTORS[best] * self._nominal
+        self._filter.mean[-len(self._velocity):] = self._velocity
         self._filter.assimilate(voltages, currents)
 
     def estimate(self, lag: int = 0) -> Estimate:
@@ -95,9 +96,8 @@ def correlate(signals: np.ndarray, gap: int, lags: np.ndarray) -> np.ndarray:
             correlations.append(0.0)
             continue
         late = signals[whole:-1] + (lag - whole) * np.diff(signals[whole:], axis=0)
-        pair = np.stack([signals[:len(late), :-gap], late[:, gap:]])
-        pair -= pair.mean(axis=1, keepdims=True)
-        early, late = pair
+        early, late = (each - each.mean(axis=0)
+                       for each in (signals[:len(late), :-gap], late[:, gap:]))
         norm = np.sqrt((early**2).sum() * (late**2).sum())
         correlations.append((early * late).sum() / max(norm, 1e-300))
     return np.array(correlations)
@@ -116,4 +116,4 @@ class Estimator(FilterEstimator):
 
     @staticmethod
     def suits(task: Task) -> bool:
-        return task.velocity is not None and hasattr(task.vessel, "length")
+        return task.velocity is not None
