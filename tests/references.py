@@ -140,6 +140,11 @@ def reference_model(*arguments, **options) -> cem.CompleteElectrodeModel:
     return model
 
 
+def unsymmetrised(model: cem.CompleteElectrodeModel, conductivity: np.ndarray) -> np.ndarray:
+    """Return 𝓡 with the last electrode grounded, (L − 1, L − 1), from the factorisation."""
+    return model._system.port_inverse(model._assemble(conductivity))
+
+
 def reference_flow(*arguments, **options) -> transport.ConvectionDiffusion:
     """A `ConvectionDiffusion` without compiled kernels."""
     with references():

@@ -76,7 +76,7 @@ def update(names: list[str], *, new_version: bool = False) -> Iterator[tuple[str
     files. Yield name, status (``new``, ``same``, ``moved``, or the new version) and differences.
 
     With ``new_version``, a method's file whose numbers differ is rewritten with the next version
-    number. Other files are never changed. ``ValueError`` if a name is neither a built-in id nor a
+    number. No other file is changed. ``ValueError`` if a name is neither a built-in id nor a
     built-in method.
     """
     known = [*tracks.builtin_ids(), *golden_methods()]

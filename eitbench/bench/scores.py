@@ -101,8 +101,7 @@ class Score:
     deterministic: bool = True
     """True if a rerun of the episode gives the same number; false for times."""
     rounding: float = 0.0
-    """Difference between reruns that rounding may cause beyond a relative one: a fraction of nodes
-    changes where a node is at the end of an interval."""
+    """Difference that rounding may cause in a rerun, as in a fraction of nodes that are counted."""
 
     def __post_init__(self) -> None:
         if not self.name.isidentifier() or self.name != self.name.lower() or self.name[0] == "_":

@@ -56,8 +56,7 @@ def test_reduced_states_carry_inflows_as_the_flow_does(parts):
 def test_reduced_derivatives_are_those_of_the_steps(parts):
     """Derivatives equal central differences of mean and coordinates, also for the covariance.
     Before the first measurement the state is stationary: about x = 0 a step changes only the
-    contribution that
-    leaves the pipe."""
+    contribution that leaves the pipe."""
     model = parts[2]
     states, rng = InflowStates(model), np.random.default_rng(1)
     first = states.initial()

@@ -1,6 +1,5 @@
 """All state spaces and covariance forms agree with the joint Gaussian of all states given all measurements."""
 
-
 import numpy as np
 import pytest
 from eitbench.estimation import (

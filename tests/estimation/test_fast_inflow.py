@@ -95,3 +95,19 @@ def test_derivatives_of_voltages(model):
         ends = [voltages.voltages(c + sign * 1e-4 * way, task.currents[:3]) for sign in (1, -1)]
         expected = (ends[0] - ends[1]) / 2e-4
         np.testing.assert_allclose(slopes @ way, expected, atol=1e-6 * np.abs(expected).max())
+
+
+def test_every_pair_of_electrodes_is_contracted_once(monkeypatch):
+    """Contractions of all 120 pairs are computed once and stay in the cache."""
+    calls = []
+    real = QuadraticVoltageModel._contracted
+    monkeypatch.setattr(QuadraticVoltageModel, "_contracted",
+                        lambda self, currents: calls.append(1) or real(self, currents))
+    task, basis, _ = fast()
+    model = QuadraticVoltageModel(task.observation, task.expected_concentration, basis[:, :4])
+    pairs = np.eye(16)[:, None] - np.eye(16)
+    pairs = pairs[np.triu_indices(16, 1)]
+    c = np.full(task.mesh.n_nodes, task.expected_concentration)
+    first, again = (model.voltages(c, pairs) for _ in range(2))
+    np.testing.assert_array_equal(first, again)
+    assert len(pairs) == len(calls) == 120

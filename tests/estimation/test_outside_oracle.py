@@ -1,5 +1,5 @@
-"""Extended filters agree with cuthbert, an independent implementation in JAX (square-root forms,
-automatic differentiation)."""
+"""Filters and smoothers agree with cuthbert, an independent implementation in JAX (square-root forms, automatic
+differentiation)."""
 
 import numpy as np
 import pytest
@@ -10,15 +10,18 @@ from eitbench.estimation import (
     LogStates,
     Motion,
     NodalStates,
+    fixed_interval_smoother,
+    kalman_filter,
 )
-from models import QuadraticModel, random_model
+from models import QuadraticModel, draw, random_design, random_model
 
 jax = pytest.importorskip("jax")
 pytest.importorskip("cuthbert")
 jax.config.update("jax_enable_x64", True)
 
 from cuthbert import filter as run_filter  # noqa: E402
-from cuthbert.gaussian import moments  # noqa: E402
+from cuthbert import smoother as run_smoother  # noqa: E402
+from cuthbert.gaussian import kalman, moments  # noqa: E402
 from jax import numpy as jnp  # noqa: E402
 
 T = 8
@@ -29,6 +32,31 @@ def assert_gaussians(means, covariances, states):
     variances = (np.asarray(covariances)**2).sum(axis=2)
     for theirs, ours in ((means, [state.mean for state in states]), (variances, [state.variance for state in states])):
         np.testing.assert_allclose(ours, theirs, rtol=0, atol=1e-9 * np.abs(theirs).max())
+
+
+def dynamics(model):
+    """Return F, s and a square root of Q."""
+    root = np.linalg.cholesky(model.Q)
+    return lambda inputs: (model.F, model.s, root)
+
+
+def test_linear_gaussian_model():
+    rng = np.random.default_rng(3)
+    model = random_model(rng)
+    model = model._replace(Q=model.Q + np.eye(14))
+    _, observations = draw(model, random_design(rng, 14, T), rng)
+    H, y, variance = (np.stack(part) for part in list(zip(*observations, strict=True))[:3])
+    inputs = H, y, np.sqrt(variance)
+
+    def measurement(inputs):
+        H, y, std = inputs
+        return H, jnp.zeros(len(y)), jnp.diag(std), y
+
+    theirs = kalman.build_filter(model.mean, np.linalg.cholesky(model.covariance), dynamics(model), measurement)
+    states = run_filter(theirs, inputs, theirs.init_prepare())
+    assert_gaussians(states.mean[1:], states.chol_cov[1:], kalman_filter(model.filter(), observations))
+    smoothed = run_smoother(kalman.build_smoother(dynamics(model)), states)
+    assert_gaussians(smoothed.mean[1:], smoothed.chol_cov[1:], fixed_interval_smoother(model.filter(), observations))
 
 
 @pytest.mark.parametrize("logarithm", [False, True], ids=["concentration", "logarithm"])
@@ -55,7 +83,8 @@ def test_extended_filter(logarithm):
         steps.append(step._replace(variance=ours.covariance.diagonal()))
 
     def motion(state, inputs):
-        return (lambda x: (model.F @ x + model.s, np.linalg.cholesky(model.Q))), state.mean
+        F, s, root = dynamics(model)(inputs)
+        return (lambda x: (F @ x + s, root)), state.mean
 
     def measurement(state, inputs):
         voltages, current = inputs

@@ -101,8 +101,7 @@ def test_electrode_disc(spans, cells, rings, smallest):
 def test_prisms_are_filled_and_neighbours_agree(section):
     """The nodes at every z are the section's, in its order. Three tetrahedra of one volume fill a
     prism, with nodes in two neighbouring sections; every facet inside has two cells; outside are
-    two ends and the
-    sides."""
+    two ends and the sides."""
     # Renumbered at random: the diagonals must fit together however the section is numbered.
     place = np.random.default_rng(2).permutation(section.n_nodes)
     section = Mesh(section.points[np.argsort(place)], place[section.cells])

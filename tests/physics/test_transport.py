@@ -1,6 +1,5 @@
 """Convection–diffusion against exact solutions, dense linear algebra, and itself."""
 
-
 import numpy as np
 import pytest
 import scipy.linalg
