@@ -1,5 +1,5 @@
 """Value of adaptive injections with an unknown flow and a fitted inflow prior:
-`python studies/flow_inflow_prior.py`, half an hour.
+`python studies/flow_inflow_prior.py`, a quarter of an hour.
 
 The filter inside estimates the velocity and the last inflows with their fitted prior
 (`VelocityInflowWindow`), in place of the white inflow of `eitbench/Pipe2DInjectionFlow-v0`. The
@@ -128,7 +128,7 @@ def run(rules: Rules, policy: str, seed: int,
 
 def main() -> None:
     parser = argparse.ArgumentParser(description="Adaptive injections with an unknown flow.")
-    parser.add_argument("--seeds", default="dev:0-15")
+    parser.add_argument("--seeds", default="dev:0-7")
     arguments = parser.parse_args()
     seeds = parse_seeds(arguments.seeds)
     rules = Rules(entry("eitbench/Pipe2DInjectionFlow-v0").world)
