@@ -22,7 +22,6 @@ from eitbench.data import cache
 from eitbench.data.episodes import (
     Episode,
     cache_per_truth,
-    cached_truth_model,
     simulate,
     simulate_batch,
 )
@@ -30,7 +29,7 @@ from eitbench.physics.profiles import VelocityModel
 from eitbench.worlds.instrument import Faults, Instrument
 from eitbench.worlds.random_streams import episode_streams
 from eitbench.worlds.task import make_task
-from eitbench.worlds.world import World
+from eitbench.worlds.world import Vessel, World
 
 if TYPE_CHECKING:
     from eitbench.numerics.mesh import Mesh  # finite elements: cached episodes do not need them
@@ -282,16 +281,19 @@ def region_file(world: World) -> cache.File:
 
 def truth_mesh(world: World) -> Mesh:
     """Return the mesh of the ground truth."""
-    return cached_truth_model(world).transport.mesh
+    return _score_operators(world.vessel)[0]
 
 
-@cache_per_truth
 def score_operators(world: World) -> tuple[sp.csr_array, sp.csr_array]:
     """Return P and M over the whole vessel."""
+    return _score_operators(world.vessel)[1:]
+
+
+@lru_cache(maxsize=4)
+def _score_operators(vessel: Vessel) -> tuple[Mesh, sp.csr_array, sp.csr_array]:
     from eitbench.numerics.fem import mass_matrix
-    truth = truth_mesh(world)
-    model = world.vessel.transport_mesh(fine=False)[0]
-    return model.interpolation_to(truth.points), mass_matrix(truth)
+    truth, model = (vessel.transport_mesh(fine)[0] for fine in (True, False))
+    return truth, model.interpolation_to(truth.points), mass_matrix(truth)
 
 
 @cache_per_truth

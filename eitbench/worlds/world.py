@@ -18,6 +18,8 @@ from eitbench.worlds.schedule import Schedule
 from eitbench.worlds.stored_names import add_current_members
 
 if TYPE_CHECKING:
+    import scipy.sparse as sp
+
     from eitbench.numerics.mesh import Mesh
     from eitbench.physics.cem import CompleteElectrodeModel
     from eitbench.physics.flow import RoundPipeFlow
@@ -303,7 +305,7 @@ class World:
         # finite elements: cached episodes do not need them
         from eitbench.physics.stationary import StationaryTransport
         from eitbench.physics.transport import ConvectionDiffusion
-        mesh, inlet = self.vessel.transport_mesh(fine)
+        mesh, inlet, cem, to_potential = _vessel_models(self.vessel, fine)
         transport: Transport
         if velocity is None:
             transport = StationaryTransport(mesh, self.time_step)
@@ -312,8 +314,7 @@ class World:
             transport = ConvectionDiffusion(
                 mesh, velocity, self.flow.diffusivity, self.time_step / parts,
                 substeps=self.vessel.substeps(fine), inlet=inlet)
-        cem = self.vessel.electrode_model(fine)
-        observation = ObservationModel(cem, mesh.interpolation_to(cem.mesh.points),
+        observation = ObservationModel(cem, to_potential,
                                        LinearConductivity(self.vessel.molar_conductivity),
                                        1e-2 * self.expected_concentration)
         return Discretisation(transport, observation)
@@ -366,6 +367,16 @@ class World:
                                 contact_impedance_spread=self.instrument.contact_impedance_spread)
         prior = Prior(self.expected_concentration)
         return replace(self.fault_free, instrument=instrument, prior=prior)
+
+
+@lru_cache(maxsize=4)
+def _vessel_models(vessel: Vessel, fine: bool,
+                   ) -> tuple[Mesh, np.ndarray, CompleteElectrodeModel, sp.csr_array]:
+    """Return the transport mesh, its inlet, the electrode model and the interpolation to its mesh;
+    worlds of the same vessel share them."""
+    mesh, inlet = vessel.transport_mesh(fine)
+    cem = vessel.electrode_model(fine)
+    return mesh, inlet, cem, mesh.interpolation_to(cem.mesh.points)
 
 
 def _check_part(name: str, part: Any, protocol: type) -> None:
