@@ -233,6 +233,7 @@ def _content(path: Path) -> bytes:
     return path.read_bytes()
 
 
+@lru_cache(maxsize=256)
 def _class_attribute(source: bytes, name: str, default: Any) -> Any:
     """Return the literal value of an attribute of the class `Estimator` or `Policy`."""
     types = {kind.type for kind in METHOD_KINDS.values()}

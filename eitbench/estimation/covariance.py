@@ -15,6 +15,7 @@ from eitbench import _check
 
 _BLOCK = 128
 """Number of columns copied at once when a triangle is mirrored; a block fits the CPU cache."""
+_LOWER = np.tri(_BLOCK, k=-1, dtype=bool)
 
 COMPRESSED_FROM = 8
 """Time of the first compression of the transient; before, its rank has hardly decreased."""
@@ -143,8 +144,8 @@ def _mirror(P: np.ndarray) -> None:
     """Copy the upper triangle of a square matrix to the lower one."""
     for begin, end in pairwise([*range(0, len(P), _BLOCK), len(P)]):
         P[begin:end, :begin] = P[:begin, begin:end].T
-        corner = np.triu(P[begin:end, begin:end])
-        P[begin:end, begin:end] = corner + np.triu(corner, 1).T
+        corner = P[begin:end, begin:end]
+        np.copyto(corner, corner.T, where=_LOWER[:end - begin, :end - begin])
 
 
 class OpenLoopCovariance:

@@ -8,9 +8,18 @@ import pytest
 import scipy.optimize
 from eitbench import make_task
 from eitbench.bench.methods import load_method
-from eitbench.estimation import best_homogeneous, one_step, smoothness_covariance, total_variation
+from eitbench.data.episode_cache import cached_episode, cycle_voltages
+from eitbench.estimation import (
+    best_homogeneous,
+    full_window_filter,
+    maximise_posterior,
+    one_step,
+    smoothness_covariance,
+    total_variation,
+)
 from eitbench.numerics.mesh import rectangle_mesh
 from eitbench.worlds.catalogue import PIPE_2D
+from models import tiny_prior, tiny_task
 from test_gauss_newton import Linear, small_tank
 
 from tiny_worlds import TINY
@@ -113,6 +122,44 @@ def test_random_walk_filter_conditions_one_gaussian_of_all_states():
     reduction = (cross * np.linalg.solve(S, cross)).sum(axis=0)
     expected = (initial + n_steps * step).diagonal() - reduction
     np.testing.assert_allclose(estimate.variance, expected, rtol=1e-7)
+
+
+@pytest.mark.parametrize("factor", [0.25, 1.0, 3.0])
+def test_adaptive_filter_finds_the_variance_of_the_inflow(factor):
+    """If the task states ``factor`` times the standard deviation of the inflow, q becomes 1/factor²."""
+    task, rng, c_ref = tiny_task(), np.random.default_rng(4), 28.0
+    std = task.prior.inflow_std
+    stated = replace(task, prior=replace(task.prior, inflow_std=factor * std))
+    module = load_method("adaptive_inflow_filter", "estimation").make.__init__.__globals__
+    truth, filter_ = module["AdaptiveFilter"](task, c_ref).space, module["AdaptiveFilter"](stated, c_ref)
+    inflows, found = np.zeros((truth.window_steps, truth.n_modes)), []
+    for t in range(400):
+        inflows = np.concatenate([rng.standard_normal((1, truth.n_modes)), inflows[:-1]])
+        I = task.currents[t % len(task.currents)]
+        clean = task.observation.voltages(truth.concentration(inflows.ravel()), I[None])[0]
+        filter_.assimilate(clean + task.noise.std(clean) * rng.standard_normal(clean.size), I)
+        found.append(filter_.log_q)
+    assert np.mean(found[200:]) == pytest.approx(-2.0 * np.log(factor), abs=0.4)
+
+
+def test_ensemble_smoother_has_the_most_probable_inflow():
+    """Mean and variance agree with the maximum of the posterior density and the Laplace approximation there, but for
+    the sampling error of the ensemble."""
+    task, prior, c_ref = tiny_task(), tiny_prior(), 29.0
+    currents = TINY.currents[np.arange(TINY.n_steps) % len(TINY.currents)]
+    record = [*zip(cycle_voltages(TINY, 0, cached_episode(TINY, 0)), currents, strict=True)]
+    record[1][0][2] = np.nan
+    module = load_method("ensemble_smoother", "estimation").make.start.__globals__
+    found = module["smooth"](task, prior, c_ref, record)
+    smoother = full_window_filter(task, prior, c_ref, record)
+    before = smoother.space.initial()
+    maximise_posterior(smoother, task, record)
+    for lag, estimate in enumerate(reversed(found)):
+        exact = smoother.estimate(lag)
+        uninformed = smoother.space.variance(*before, lag)
+        gained = uninformed.mean() - exact.variance.mean()
+        assert ((estimate.mean - exact.mean)**2).mean() < 0.02 * gained
+        assert abs(estimate.variance.mean() - exact.variance.mean()) < 0.025 * gained
 
 
 def image(method, task, voltages):
