@@ -1,5 +1,5 @@
-"""Extended Kalman filter that estimates the variance of the inflow, q times that of thesis Table
-5.1 (after Myers & Tapley, IEEE Trans. Autom. Control 21, 1976).
+"""Extended Kalman filter with an inflow of unknown variance, q times the value of thesis Table 5.1
+(after Myers & Tapley, IEEE Trans. Autom. Control 21, 1976).
 
 The inflow is white noise, and the state holds the inflows of a residence time. If the square of a
 correction K ν exceeds its expectation tr(K S Kᵀ), q is too small: ln q changes by RATE times the
