@@ -53,6 +53,7 @@ SHORT = {
     "BubbleTracking": {"schedule": {"scored_steps": 4}},
     "TwoBubbleTracking": {"schedule": {"scored_steps": 4}},
     "RisingBubbles2D": {"schedule": {"warm_up": 1, "scored_steps": 4}},
+    "TwoBubbles2D": {"schedule": {"warm_up": 1, "scored_steps": 4}},
     "TankInjection": {"schedule": {"warm_up": 2, "scored_steps": 3}},
 }
 """Name of a world -> overrides for short episodes. Worlds of the track injection keep vessel and flow, for which the

@@ -9,7 +9,7 @@ import pytest
 
 ROOT = Path(__file__).parent.parent
 PACKAGE = ROOT / "eitbench"
-BUDGETS = {"numerics": 1658, "scoring": 142, "physics": 1681, "worlds": 2759, "data": 1479, "estimation": 6708,
+BUDGETS = {"numerics": 1658, "scoring": 142, "physics": 1681, "worlds": 2761, "data": 1479, "estimation": 6708,
            "measured": 1917, "envs": 1683, "bench": 4613, "report": 2738, "rl": 848, "cli": 1013}
 """Package (or module) -> lines of Python allowed, blank lines and docstrings included. Each imports only from those
 before it."""

@@ -218,8 +218,10 @@ BUBBLE_TRACKING = World(
 """The mesh of the truth changes voltages by 0.2 standard deviations of the noise (median of the
 pairs), of a bubble at the wall by up to 2.2 (``tests/worlds/test_wandering_body.py``). All numbers
 [E]."""
-add_extension(replace(BUBBLE_TRACKING, name="RisingBubbles2D",
-                      instrument=replace(BUBBLE_TRACKING.instrument, readings="all")))
+RISING_BUBBLES_2D = add_extension(replace(
+    BUBBLE_TRACKING, name="RisingBubbles2D",
+    instrument=replace(BUBBLE_TRACKING.instrument, readings="all")))
+add_extension(replace(RISING_BUBBLES_2D, name="TwoBubbles2D", target=RisingBubble(n_bodies=2)))
 add_injection(BUBBLE_TRACKING, test_seeds="test:0-49")
 add_injection(replace(BUBBLE_TRACKING, name="TwoBubbleTracking", target=RisingBubble(n_bodies=2)),
               test_seeds="test:0-49")
