@@ -18,7 +18,9 @@ from eitbench.bench.statistics import MIN_EPISODES, agent_name, stratified_boots
 OPEN_LOOP = ("adjacent", "opposite", "transverse", "best_pair", "best_cycle", "best_currents",
              "schedule")
 """Built-in policies whose injections do not depend on the measurements."""
-NOT_ADAPTIVE = {*OPEN_LOOP, "random_pair", "clairvoyant", "one_step_oracle"}
+ORACLES = ("one_step_oracle", "attainable_oracle")
+"""Policies that know the truth only at their own measurements."""
+NOT_ADAPTIVE = {*OPEN_LOOP, *ORACLES, "random_pair", "clairvoyant"}
 """These, the naive baseline, and policies with access to the ground truth."""
 
 
@@ -73,12 +75,12 @@ def adaptive_ratio(rows: pd.DataFrame) -> tuple[str, str, float, float, float]:
                                             lambda mean: mean[0] / mean[1])
 
 
-def attained_fraction(rows: pd.DataFrame, adaptive: str,
-                      open_loop: str) -> tuple[float, float, float]:
-    """Return (open loop − adaptive) / (open loop − one-step oracle) of mean errors with the ends of
-    its 95 % interval; ``KeyError`` unless these have run on all episodes."""
+def attained_fraction(rows: pd.DataFrame, adaptive: str, open_loop: str,
+                      oracle: str) -> tuple[float, float, float]:
+    """Return (open loop − adaptive) / (open loop − oracle) of mean errors with the ends of its 95 %
+    interval; ``KeyError`` unless these have run on all episodes."""
     errors = errors_by_policy(rows).dropna(axis=1)
-    return _bootstrap(errors[[open_loop, adaptive, "one_step_oracle"]],
+    return _bootstrap(errors[[open_loop, adaptive, oracle]],
                       lambda mean: (mean[0] - mean[1]) / (mean[0] - mean[2]))
 
 
@@ -98,8 +100,9 @@ def gap_text(rows: pd.DataFrame) -> str:
     with suppress(KeyError, ValueError):
         adaptive, open_loop, *ratio = adaptive_ratio(rows)
         texts.append(f"error of {adaptive} / {open_loop}: {_with_interval(*ratio)}")
-        fraction = attained_fraction(rows, adaptive, open_loop)
-        texts.append(f"({open_loop} − {adaptive}) / ({open_loop} − one_step_oracle): "
+        oracle = next((name for name in ORACLES if name in set(rows["policy"])), ORACLES[0])
+        fraction = attained_fraction(rows, adaptive, open_loop, oracle)
+        texts.append(f"({open_loop} − {adaptive}) / ({open_loop} − {oracle}): "
                      f"{_with_interval(*fraction)}")
     with suppress(KeyError, ValueError):        # of worlds with a body that moves by itself
         adaptive, open_loop, *ratio = adaptive_ratio(

@@ -19,9 +19,10 @@ def test_built_in_methods_load():
     ours = [load_method(name, track) for track in ("estimation", "injection") for name in builtin_methods(track)]
     roles = {method.name: method.role for method in ours if method.role}
     assert roles == {"homogeneous": "floor", "persistence": "floor", "true_model_smoother": "reference",
-                     "clairvoyant": "reference", "one_step_oracle": "reference", "random_pair": "floor"}
+                     "attainable_oracle": "reference", "clairvoyant": "reference", "one_step_oracle": "reference",
+                     "random_pair": "floor"}
     assert [method.name for method in ours if method.privileged] == [
-        "true_model_smoother", "clairvoyant", "one_step_oracle"]
+        "true_model_smoother", "attainable_oracle", "clairvoyant", "one_step_oracle"]
 
 
 @pytest.mark.parametrize(("source", "message"), [

@@ -1,6 +1,7 @@
 """Injection policies: belief, rollouts and error messages."""
 
 import json
+from types import SimpleNamespace
 
 import numpy as np
 import pandas as pd
@@ -10,6 +11,7 @@ from eitbench.bench.methods import builtin_methods, load_method
 from eitbench.bench.run import Job, run_jobs
 from eitbench.bench.store import EpisodeStore
 from eitbench.bench.tracks import Environment
+from eitbench.data.episode_cache import truth_mesh
 from eitbench.data.seeds import parse_seeds
 from eitbench.envs.injection import InjectionEnv
 from eitbench.estimation.onboard.belief import Belief
@@ -158,6 +160,34 @@ def test_slug_triggered_follows_a_slug_and_rests_after_it():
     assert len(injected) == 30 and injected[-1] == 174
 
 
+def test_attainable_oracle_knows_the_truth_at_its_injections_only(monkeypatch):
+    """A slug at the inlet adds injections at short intervals; the truth at other times has no effect."""
+    rules = Rules(entry("eitbench/Pipe2DInjectionInflowBudget-v0").world, inflow="learned")
+    policy_type = load_method("attainable_oracle", "injection").make
+    monkeypatch.setitem(policy_type.__init__.__globals__, "simulate",
+                        lambda *_, **__: SimpleNamespace(concentration=truth))
+    inlet = truth_mesh(rules.world).points[:, 0] < 0.01
+    empty = np.ones((181, len(inlet)))
+
+    def measured_at():
+        """Return the times of the measurements of the policy's injections."""
+        core = SimpleNamespace(t=0, seeds=[0])
+        policy, currents, times = policy_type(rules, np.random.default_rng(0), core), np.zeros(16), []
+        for core.t in range(180):
+            action = policy.act({"currents": currents, "left": np.array([180.0 - core.t, 30.0 - len(times)])})
+            currents = rules.currents(np.array([action]))[0]
+            times += [core.t + 1] * bool(currents.any())
+        return times
+
+    truth = empty
+    evenly = measured_at()
+    truth = empty + 0.3 * (inlet & (np.abs(np.arange(181) - 60) < 10)[:, None])
+    times = measured_at()
+    assert min(np.diff(times)) == 3 and min(np.diff(evenly)) >= 5
+    truth = truth + 0.5 * (inlet & ~np.isin(np.arange(181), times)[:, None])
+    assert measured_at() == times
+
+
 @pytest.mark.parametrize("name", [CURRENTS, BUDGET, FLOW, TANK])
 @pytest.mark.parametrize("policy", builtin_methods("injection"))
 def test_policies_run_in_compatible_environments(policy, name, monkeypatch):
@@ -247,10 +277,11 @@ def test_adaptivity_gap_is_the_formula():
 def test_attained_fraction_compares_with_the_oracle():
     """The mean errors are 4, 2 and 1."""
     table = hand_made(best_cycle=[2.0, 4.0, 6.0], greedy_a=[1.0, 3.0, 2.0], one_step_oracle=[1.0, 1.0, 1.0])
-    assert attained_fraction(table, "greedy_a", "best_cycle") == (pytest.approx(2.0 / 3.0), -np.inf, np.inf)
+    fraction = attained_fraction(table, "greedy_a", "best_cycle", "one_step_oracle")
+    assert fraction == (pytest.approx(2.0 / 3.0), -np.inf, np.inf)
     assert "(best_cycle − greedy_a) / (best_cycle − one_step_oracle): 0.67" in gap_text(table.assign(ospa=None))
     with pytest.raises(KeyError):
-        attained_fraction(table[table["policy"] != "one_step_oracle"], "greedy_a", "best_cycle")
+        attained_fraction(table, "greedy_a", "best_cycle", "attainable_oracle")
 
 
 def test_adaptive_ratio_is_the_ratio_of_means():
