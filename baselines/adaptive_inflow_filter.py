@@ -56,5 +56,5 @@ class Estimator(FilterEstimator):
 
     @staticmethod
     def suits(task: Task) -> bool:
-        # a 3D inlet has too many nodes for a window
-        return task.mesh.dim == 2 and len(task.transport.inlet) > 0
+        # a 3D inlet has too many nodes for a window, and a body does not enter with the flow
+        return task.mesh.dim == 2 and len(task.transport.inlet) > 0 and task.body is None
