@@ -158,7 +158,7 @@ def test_ensemble_smoother_has_the_most_probable_inflow():
         exact = smoother.estimate(lag)
         uninformed = smoother.space.variance(*before, lag)
         gained = uninformed.mean() - exact.variance.mean()
-        assert ((estimate.mean - exact.mean)**2).mean() < 0.02 * gained
+        assert ((estimate.mean - exact.mean)**2).mean() < 0.04 * gained
         assert abs(estimate.variance.mean() - exact.variance.mean()) < 0.025 * gained
 
 
