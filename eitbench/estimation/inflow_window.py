@@ -234,11 +234,16 @@ class _WhitenedVoltages:
             computed = task.observation.voltages(point, currents[None])[0]
             corrected[t] = seen.value - seen.matrix @ point + computed   # without the mean error
             root = np.zeros((len(voltages), 0)) if seen.noise_root is None else seen.noise_root
-            covariances.append(np.diag(seen.noise_variance) + root @ root.T)
+            covariance = np.diag(seen.noise_variance) + root @ root.T
+            missing = np.isnan(corrected[t])       # independent of the others, and then left out
+            covariance[missing] = covariance[:, missing] = 0.0
+            covariance[missing, missing] = 1.0
+            covariances.append(covariance)
         self.whitener = np.linalg.inv(np.linalg.cholesky(covariances))
         """(T, L, L) A_t"""
-        self.measured = self._whitened(corrected)
-        """(T, L) whitened V_t"""
+        self.measured = self._whitened(np.nan_to_num(corrected))
+        """(T, L) whitened V_t; NaN: not measured"""
+        self.measured[np.isnan(corrected)] = np.nan
 
     def state(self, z: np.ndarray) -> np.ndarray:
         """Return x = L z."""
