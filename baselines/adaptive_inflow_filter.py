@@ -40,6 +40,8 @@ class AdaptiveFilter:
         self.space.ar_model = self.weights, np.exp(self.log_q) * self.variances
         step = self.filter.assimilate(voltages, currents)
         used = step.accepted
+        if not used.any():
+            return
         cross = step.cross_covariance[:, used]
         gain = np.linalg.solve(step.innovation_covariance[np.ix_(used, used)], cross.T)
         correction = step.innovation[used] @ gain

@@ -3,7 +3,7 @@ on all measurements several times (Emerick & Reynolds, Comput. Geosci. 55, 2013)
 
 The inflow's logarithm has the coloured prior of `inflow_smoother`. Each of PASSES passes computes
 the voltages of every member without linearisation and inflates the noise variance by PASSES. An
-inflow is conditioned only on the measurements of its fluid, which removes spurious correlations.
+inflow is conditioned only on the measurements of its fluid: this limits sampling errors.
 """
 
 from collections.abc import Sequence
@@ -53,15 +53,13 @@ def smooth(task: Task, prior: InflowPrior, c_ref: float,
         std = task.noise.std(computed.mean(axis=1))[:, None]
         noise = PASSES**0.5 * random.standard_normal(computed.shape)
         residual = np.nan_to_num((V[:, None] - computed) / std + noise)    # NaN: not measured
-        S = (computed - computed.mean(axis=1, keepdims=True)) / std / (MEMBERS - 1)**0.5
-        S[np.isnan(V)[:, None].repeat(MEMBERS, axis=1)] = 0.0
-        moved = x.copy()
+        S = np.where(np.isnan(V)[:, None], 0.0, computed - computed.mean(axis=1, keepdims=True))
+        S /= std * (MEMBERS - 1)**0.5
         for k, newest in enumerate(range(len(record), len(record) - len(x), -1)):
             seen = slice(max(newest - 1, 0), max(newest - 1 + space.response_steps, 0))
             A, d = (array[seen].swapaxes(1, 2).reshape(-1, MEMBERS) for array in (S, residual))
             gain = np.linalg.solve(A.T @ A + PASSES * np.eye(MEMBERS), A.T @ d)      # (N, N)
             deviation = (x[k] - x[k].mean(axis=0)) / (MEMBERS - 1)**0.5
-            moved[k] += gain.T @ deviation
-        x = moved
+            x[k] += gain.T @ deviation
     ensembles = (states(t) for t in range(1, len(record) + 1))
     return [Estimate(c.mean(axis=0), c.var(axis=0, ddof=1)) for c in ensembles]

@@ -1,8 +1,8 @@
 """Choose the constants of methods without a flow model, and of the adaptive filter: `python
 studies/tune_random_walk.py [METHOD …]`.
 
-The rule: the smallest mean error on a grid, in filtering in the 2D pipe on train:0-1. It takes
-20 minutes. Dev and test episodes are not used.
+The rule: the smallest mean error on a grid, in filtering in the 2D pipe on train:0-1. It takes 15
+to 20 minutes. Dev and test episodes are not used.
 """
 
 import sys

@@ -281,19 +281,24 @@ def region_file(world: World) -> cache.File:
 
 def truth_mesh(world: World) -> Mesh:
     """Return the mesh of the ground truth."""
-    return _score_operators(world.vessel)[0]
+    return _truth_mesh(world.vessel)
+
+
+@lru_cache(maxsize=4)
+def _truth_mesh(vessel: Vessel) -> Mesh:
+    return vessel.transport_mesh(fine=True)[0]
 
 
 def score_operators(world: World) -> tuple[sp.csr_array, sp.csr_array]:
     """Return P and M over the whole vessel."""
-    return _score_operators(world.vessel)[1:]
+    return _score_operators(world.vessel)
 
 
 @lru_cache(maxsize=4)
-def _score_operators(vessel: Vessel) -> tuple[Mesh, sp.csr_array, sp.csr_array]:
+def _score_operators(vessel: Vessel) -> tuple[sp.csr_array, sp.csr_array]:
     from eitbench.numerics.fem import mass_matrix
     truth, model = (vessel.transport_mesh(fine)[0] for fine in (True, False))
-    return truth, model.interpolation_to(truth.points), mass_matrix(truth)
+    return model.interpolation_to(truth.points), mass_matrix(truth)
 
 
 @cache_per_truth

@@ -100,10 +100,10 @@ def gap_text(rows: pd.DataFrame) -> str:
     with suppress(KeyError, ValueError):
         adaptive, open_loop, *ratio = adaptive_ratio(rows)
         texts.append(f"error of {adaptive} / {open_loop}: {_with_interval(*ratio)}")
-        oracle = next((name for name in ORACLES if name in set(rows["policy"])), ORACLES[0])
-        fraction = attained_fraction(rows, adaptive, open_loop, oracle)
-        texts.append(f"({open_loop} − {adaptive}) / ({open_loop} − {oracle}): "
-                     f"{_with_interval(*fraction)}")
+        for oracle in (name for name in ORACLES if name in set(rows["policy"])):
+            fraction = attained_fraction(rows, adaptive, open_loop, oracle)
+            texts.append(f"({open_loop} − {adaptive}) / ({open_loop} − {oracle}): "
+                         f"{_with_interval(*fraction)}")
     with suppress(KeyError, ValueError):        # of worlds with a body that moves by itself
         adaptive, open_loop, *ratio = adaptive_ratio(
             rows.assign(error=pd.to_numeric(rows["ospa"])**2))

@@ -174,7 +174,8 @@ def test_attainable_oracle_knows_the_truth_at_its_injections_only(monkeypatch):
         core = SimpleNamespace(t=0, seeds=[0])
         policy, currents, times = policy_type(rules, np.random.default_rng(0), core), np.zeros(16), []
         for core.t in range(180):
-            action = policy.act({"currents": currents, "left": np.array([180.0 - core.t, 30.0 - len(times)])})
+            left = np.array([180.0 - core.t, 30.0 - len(times)])
+            action = policy.act({"currents": currents, "mean": np.full(36, 400.0), "left": left})
             currents = rules.currents(np.array([action]))[0]
             times += [core.t + 1] * bool(currents.any())
         return times

@@ -133,6 +133,7 @@ def test_adaptive_filter_finds_the_variance_of_the_inflow(factor):
     module = load_method("adaptive_inflow_filter", "estimation").make.__init__.__globals__
     truth, filter_ = module["AdaptiveFilter"](task, c_ref).space, module["AdaptiveFilter"](stated, c_ref)
     inflows, found = np.zeros((truth.window_steps, truth.n_modes)), []
+    filter_.assimilate(np.full(task.currents.shape[1], np.nan), task.currents[0])     # nothing was measured
     for t in range(400):
         inflows = np.concatenate([rng.standard_normal((1, truth.n_modes)), inflows[:-1]])
         I = task.currents[t % len(task.currents)]
