@@ -57,7 +57,7 @@ def image_error(env: Any) -> float:
         filters = core._filters.filter
         core.load_until(core.world.n_steps)
         for t in range(core.world.warm_up + 1, core.world.n_steps + 1):
-            for values, true in zip(filters.bodies[0].particles, (
+            for values, true in zip(filters.particles, (
                     body.centres[t], 0.0, (body.radius / filters.model.radius)**2,
                     body.present[t]), strict=True):
                 values[:] = true

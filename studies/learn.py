@@ -99,6 +99,7 @@ SETUPS = {
     "voltages": TrainingSetup("eitbench/Pipe2D-v0", "pipe2d-voltages.npz", (100, 200, 400),
                               input_features="voltages", noise=0.2),
 }
+Setup = StrEnum("Setup", {name: name for name in SETUPS})  # type: ignore[misc]
 LAGS = (4, 20)
 """Lags at which fixed-lag estimates are cached too."""
 FEATURES = ("inputs", "reduced", "truth", "rest", "weight")
@@ -256,17 +257,19 @@ class Loss:
 
 
 def train(setup: TrainingSetup, data: Tensors, dev: Tensors, loss: Loss, seed: int,
-          epochs: int = EPOCHS) -> tuple[Correction, float]:
-    """Train a network; return it and its ẽ_c on ``dev``."""
+          epochs: int = EPOCHS, learning_rate: float = LEARNING_RATE,
+          core: torch.nn.Module | None = None) -> tuple[Correction, float]:
+    """Train a network, with a ``core`` instead of the GRU if given; return it and its ẽ_c on
+    ``dev``."""
     torch.manual_seed(seed)
     residual = (data["reduced"] - data["truth"])[:, loss.warm_up:]
     network = Correction(data["inputs"].std(dim=(0, 1)), (residual**2).mean(dim=(0, 1)).sqrt(),
-                         setup.hidden, setup.bidirectional, setup.noise)
-    optimiser = torch.optim.AdamW(network.parameters(), lr=LEARNING_RATE,
+                         setup.hidden, setup.bidirectional, setup.noise, core)
+    optimiser = torch.optim.AdamW(network.parameters(), lr=learning_rate,
                                   weight_decay=WEIGHT_DECAY)
     episodes = len(data["inputs"])
     schedule = torch.optim.lr_scheduler.OneCycleLR(
-        optimiser, LEARNING_RATE, total_steps=epochs * -(-episodes // BATCH_SIZE), pct_start=0.1)
+        optimiser, learning_rate, total_steps=epochs * -(-episodes // BATCH_SIZE), pct_start=0.1)
     filter_error = filter_errors(data)[:, loss.warm_up:].mean()
     for _ in trange(epochs, desc=f"{episodes} episodes, seed {seed}", unit="epoch", disable=None):
         for rows in torch.randperm(episodes).split(BATCH_SIZE):
@@ -283,7 +286,7 @@ def train(setup: TrainingSetup, data: Tensors, dev: Tensors, loss: Loss, seed: i
 
 
 def main(
-    name: Annotated[StrEnum("Name", {name: name for name in SETUPS}), typer.Argument()],
+    name: Annotated[Setup, typer.Argument()],
     jobs: Annotated[int, typer.Option(help="Processes that simulate and filter.")] = 2,
     seeds: Annotated[int, typer.Option(help="Training seeds for each number of episodes.")] = 5,
 ) -> None:

@@ -14,18 +14,24 @@ DIRECTIONS = (("", ""), ("backward_", "_reverse"))
 
 
 class Correction(torch.nn.Module):
-    """Network of `eitbench.estimation.corrected`, for batches of complete episodes."""
+    """Network of `eitbench.estimation.corrected`, for batches of complete episodes.
+
+    A ``core`` with the attribute ``width`` replaces the GRU; such a network cannot be stored.
+    """
 
     def __init__(self, input_scale: torch.Tensor, output_scale: torch.Tensor, hidden: int,
-                 bidirectional: bool = False, noise: float = 0.0) -> None:
+                 bidirectional: bool = False, noise: float = 0.0,
+                 core: torch.nn.Module | None = None) -> None:
         super().__init__()
         self.register_buffer("input_scale", input_scale)
         self.register_buffer("output_scale", output_scale)
         self.noise = noise
         d = len(input_scale)
         q = len(output_scale)
-        width = 2 * hidden if bidirectional else hidden
-        self.gru = torch.nn.GRU(d, hidden, batch_first=True, bidirectional=bidirectional)
+        width = core.width if core else 2 * hidden if bidirectional else hidden
+        self.core = core
+        if core is None:
+            self.gru = torch.nn.GRU(d, hidden, batch_first=True, bidirectional=bidirectional)
         self.output = torch.nn.Linear(width, 2 * q)
         self.mixing = torch.nn.Linear(width, N_LINEAR_MAPS)
         self.maps = torch.nn.Linear(d, N_LINEAR_MAPS * q, bias=False)
@@ -38,7 +44,7 @@ class Correction(torch.nn.Module):
         inputs = inputs / self.input_scale
         if self.training:
             inputs = inputs + self.noise * torch.randn_like(inputs)
-        hidden, _ = self.gru(inputs)
+        hidden = self.core(inputs) if self.core else self.gru(inputs)[0]
         hidden = torch.nn.functional.dropout(hidden, DROPOUT, self.training)
         correction, log_variance = self.output(hidden).chunk(2, dim=-1)
         maps = self.maps(inputs).unflatten(-1, (N_LINEAR_MAPS, -1))

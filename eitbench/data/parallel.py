@@ -54,11 +54,12 @@ def _with_joblib(function: Callable[..., Result], arguments: Sequence[tuple], n_
                  ) -> Iterator[Result]:
     from joblib import Parallel, delayed
     options = {"return_as": "generator_unordered", "batch_size": 1, "pre_dispatch": n_jobs}
-    # loky replaces workers whose memory has grown
-    warnings.filterwarnings("ignore", "A worker stopped while some jobs were given", UserWarning,
-                            r"joblib\.externals\.loky\.")
     try:
-        with config or nullcontext(), Parallel(n_jobs=n_jobs, **options) as parallel:
+        with (warnings.catch_warnings(), config or nullcontext(),
+              Parallel(n_jobs=n_jobs, **options) as parallel):
+            # loky replaces workers whose memory has grown
+            warnings.filterwarnings("ignore", "A worker stopped while some jobs were given",
+                                    UserWarning, r"joblib\.externals\.loky\.")
             entries = runtime_entries()
             pid = os.getpid()
             yield from parallel(delayed(_run_with_parent_watchdog)(pid, entries, function, *each)

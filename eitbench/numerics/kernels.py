@@ -494,7 +494,7 @@ def particle_likelihoods(signals, index, shares, weights, currents, electrodes, 
     Σ_k shares[b, p, k] signals[L e + d, index[b, p, k]]. ``residual`` and ``variance`` (B, m) are
     those without a particle; ``relative_error`` is a standard deviation relative to the signal.
     """
-    B, P, _ = index.shape
+    B, P, n_cells = index.shape
     m = electrodes.shape[1]
     L = currents.shape[1]
     deviations, growth = np.empty((P, m)), np.empty(P)
@@ -511,7 +511,7 @@ def particle_likelihoods(signals, index, shares, weights, currents, electrodes, 
                     change[g] += currents[b, d] * signals[row, g]
             for p in range(P):
                 signal = 0.0
-                for k in range(4):
+                for k in range(n_cells):
                     signal += shares[b, p, k] * change[index[b, p, k]]
                 rest = residual[b, a] - signal
                 spread = variance[b, a] + (relative_error * signal)**2

@@ -69,6 +69,8 @@ def episode(method: Any, env: str | gym.Env, seed: int | str, *,
             world: dict[str, Any] | None = None, times: int = 4) -> np.ndarray:
     """Run a method on an episode, and draw truth and estimate side by side.
 
+    The method's code runs in this process and can access the ground truth, files and the network.
+
     Parameters
     ----------
     method, env, world

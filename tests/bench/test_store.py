@@ -4,8 +4,6 @@ import math
 import platform
 import re
 import shlex
-import warnings
-from concurrent.futures import ThreadPoolExecutor
 from types import SimpleNamespace
 
 import numpy as np
@@ -47,24 +45,6 @@ def test_numbers_that_json_lacks_are_rejected(number, store):
     with pytest.raises(ValueError, match="JSON"):
         store.put(result(scores={"error": number}), {})
     assert [r["scores"]["error"] for r in store.results()] == [0.1]
-
-
-def test_concurrent_writers_lose_nothing(store):
-    """Four threads write 32 episodes, and a reader never reads an incomplete file."""
-    def write(worker):
-        for seed in range(8):
-            store.put(result(n := 8 * worker + seed, f"baseline{worker % 2}"), {"mean": np.full((2, 2), 1.0 * n)})
-
-    looks = []
-    with warnings.catch_warnings(), ThreadPoolExecutor(4) as pool:
-        warnings.simplefilter("error")                                       # "… is left out: it …"
-        writers = [pool.submit(write, worker) for worker in range(4)]
-        while not all(writer.done() for writer in writers):
-            looks.append(sum(len(record["episodes"]) for record in store.write_records()))
-    assert looks and looks == sorted(looks) and not any(writer.exception() for writer in writers)
-    assert [len(record["episodes"]) for record in store.write_records()] == [16, 16]
-    assert not [path for path in store.folder.rglob(".*") if path.is_file()]
-    assert all((store.fields(each)["mean"] == int(each["seed"].split(":")[1])).all() for each in store.results())
 
 
 @pytest.fixture(scope="module")

@@ -2,6 +2,7 @@
 criteria against a Gaussian of images and voltages."""
 
 from functools import lru_cache
+from itertools import cycle
 
 import numpy as np
 import pytest
@@ -21,14 +22,14 @@ from scipy.special import softmax
 from short import merged
 from short import world as short_world
 
-ID, SEARCH, BUBBLES = (f"eitbench/{name}-v0"
-                       for name in ("TankTracking", "SearchAndTrack", "BubbleTracking"))
+ID, SEARCH, BUBBLES, TWO = (f"eitbench/{name}-v0" for name in (
+    "TankTracking", "SearchAndTrack", "BubbleTracking", "TwoBubbleTracking"))
 
 
 @lru_cache(maxsize=3)
 def rules_of(id=ID):
     changes = short_world(id)["world"]
-    if id == BUBBLES:
+    if id in (BUBBLES, TWO):
         changes = merged(changes, {"vessel": {"truth_refinement": 1}})
     return Rules(entry(id).world.with_changes(changes))
 
@@ -53,7 +54,7 @@ def test_signals_are_those_of_the_complete_electrode_model(id, centre, limit):
     disc = disc_indicator(points, np.array(centre), model.radius, TRANSITION_WIDTH)
     with_body = liquid + (target.concentration - target.background) * disc
     expected = np.subtract(*(truth.observation.transfer_resistance(c) for c in (with_body, liquid)))
-    particles = BodyParticleFilter(model, 1, 1).bodies[0].particles
+    particles = BodyParticleFilter(model, 1, 1).particles
     particles.centres[:] = centre
     particles.areas[:] = 1.0
     index, weights = (each[0, 0] for each in model.cells(particles))
@@ -63,22 +64,24 @@ def test_signals_are_those_of_the_complete_electrode_model(id, centre, limit):
     assert scale == pytest.approx(1.0, abs=0.15)
 
 
-def test_weights_are_those_of_bayes_formula():
+@pytest.mark.parametrize("id", [ID, TWO])
+def test_weights_are_those_of_bayes_formula(id):
     """One measurement from equal weights: the likelihood of each particle's voltages at the measured electrodes,
-    relative to the density of the noise, and the moments of the innovation."""
-    core, _ = believed()
+    relative to the density of the noise, and the moments of the innovation. Signals of bodies add up."""
+    core, _ = believed(id)
     filters, rules = core._filters.filter, core.rules
-    (body,), model = filters.bodies, filters.model
-    body.weights[:] = 1.0 / body.n_particles
+    model = filters.model
+    model.move = lambda particles, weights, random: (particles, np.full_like(weights, 1.0 / weights.size))
     pair = 57
     (i, j), amplitude = rules.pairs[pair], rules.amplitude
-    found, body.reweight = [], lambda weights, random: found.append(weights[0])
+    found, filters.reweight = [], lambda weights: found.append(weights[0])
     core.act(np.array([pair]))
     base = amplitude * (model.resistance[i] - model.resistance[j])
     neighbours = {(k + step) % 16 for k in (i, j) for step in (-1, 1)}
     measured = sorted(neighbours - {i, j})
     std = model.noise_std(base)[measured]
-    index, weights = (each[0] for each in model.cells(body.particles))
+    del model.move
+    index, weights = (each[0] for each in model.cells(filters.particles))
     change = np.einsum("kpc,pc->pk", model.signals[:, index], weights).reshape(-1, 16, 16)
     signals = amplitude * (change[:, :, i] - change[:, :, j])[:, measured]
     variances = std**2 + (model.motion.signal_error * signals)**2
@@ -92,32 +95,26 @@ def test_weights_are_those_of_bayes_formula():
     assert np.isnan(np.delete(core._voltages[0], measured)).all()
 
 
-@pytest.mark.parametrize("id", ["eitbench/TankTracking-v0", "eitbench/TwoBubbleTracking-v0"])
+@pytest.mark.parametrize("id", [ID, TWO])
 def test_criteria_are_those_of_a_gaussian_of_images_and_voltages(id):
-    """A-criterion: the decrease of the image's variances by conditioning; D-criterion: half log det of S R⁻¹. Moments
-    of several bodies add up."""
+    """A-criterion: the decrease of the image's variances by conditioning; D-criterion: half log det of S R⁻¹."""
     _, belief = believed(id)
     filters, rules = belief._filters.filter, belief.rules
     model, random = filters.model, np.random.default_rng(1)
     gains, information = belief.criteria()
-    bodies = []
-    for body in filters.bodies:
-        particles, (w,) = model.move(body.particles, body.weights, random)
-        index, share = (each[0] for each in model.cells(particles))
-        images = np.array([belief._filters.patches[:, index[p]] @ share[p] for p in range(len(w))])
-        changes = np.array([model.signals[:, index[p]] @ share[p] for p in range(len(w))]).reshape(-1, 16, 16)
-        bodies.append((w, images, changes))
+    particles, (w,) = model.move(filters.particles, filters.weights, random)
+    index, share = (each[0] for each in model.cells(particles))
+    images = np.array([belief._filters.patches[:, index[p]] @ share[p] for p in range(len(w))])
+    changes = np.array([model.signals[:, index[p]] @ share[p] for p in range(len(w))]).reshape(-1, 16, 16)
     for pair in (0, 7, 57, 119):
         i, j = rules.pairs[pair]
         current = np.zeros(16)
         current[[i, j]] = rules.amplitude, -rules.amplitude
         measured = rules.instrument.measurement_mask(current)
         std = model.noise_std(model.resistance @ current)[measured]
-        R, joint = np.diag(std**2), 0.0
-        for w, images, changes in bodies:
-            voltages = (changes @ current)[:, measured]
-            R = R + np.diag(model.motion.signal_error**2 * (w @ voltages**2))
-            joint = joint + np.cov(np.hstack([images, voltages]).T, aweights=w, bias=True)
+        voltages = (changes @ current)[:, measured]
+        R = np.diag(std**2 + model.motion.signal_error**2 * (w @ voltages**2))
+        joint = np.cov(np.hstack([images, voltages]).T, aweights=w, bias=True)
         m = images.shape[1]
         S = joint[m:, m:] + R
         assert gains[pair] == pytest.approx(np.trace(joint[:m, m:] @ np.linalg.solve(S, joint[m:, :m])), rel=1e-6)
@@ -126,12 +123,12 @@ def test_criteria_are_those_of_a_gaussian_of_images_and_voltages(id):
 
 def test_body_has_the_moments_of_the_particles_that_are_present():
     core, _ = believed(SEARCH)
-    (body,), random = core._filters.filter.bodies, np.random.default_rng(0)
-    body.weights[:] = random.dirichlet(np.ones(body.n_particles))
-    body.particles.present[:] = random.uniform(size=body.n_particles) < 0.3
-    present = body.particles.present[0]
-    centres, velocities, areas = (each[0, present] for each in body.particles[:3])
-    w = body.weights[0, present]
+    filters, random = core._filters.filter, np.random.default_rng(0)
+    filters.weights[:] = random.dirichlet(np.ones(filters.n_particles))
+    filters.particles.present[0, :, 0] = random.uniform(size=filters.n_particles) < 0.3
+    present = filters.particles.present[0, :, 0]
+    centres, velocities, areas = (each[0, present, 0] for each in filters.particles[:3])
+    w = filters.weights[0, present]
     S = np.cov(centres.T, aweights=w, bias=True)
     std = np.sqrt(np.diag(S))
     expected = [*np.average(centres, axis=0, weights=w), *np.average(velocities, axis=0, weights=w), *std,
@@ -142,17 +139,34 @@ def test_body_has_the_moments_of_the_particles_that_are_present():
 def test_presence_without_measurements_is_that_of_the_markov_chain():
     """More particles enter than bodies; weights correct for it."""
     filters = BodyParticleFilter(body_model(make_task(rules_of(SEARCH).world)), 1, 8192)
-    (body,) = filters.bodies
     leave, enter = -np.expm1(-0.025 / np.array([1.0, 0.5]))
     expected, found, entries = [1.0], [1.0], []
     for _ in range(60):
-        absent = ~body.particles.present
+        absent = ~filters.particles.present
         filters.assimilate(*np.zeros((2, 1, 16)), np.zeros((1, 16), dtype=bool))
-        entries.append((absent & body.particles.present).sum() / max(absent.sum(), 1))
+        entries.append((absent & filters.particles.present).sum() / max(absent.sum(), 1))
         expected.append(expected[-1] * (1.0 - leave) + (1.0 - expected[-1]) * enter)
-        found.append(body.summary()[0, -1])
+        found.append(filters.summaries()[0, 0, -1])
     np.testing.assert_allclose(found, expected, atol=0.04)
     assert np.max(entries) > 5.0 * enter
+
+
+def test_lost_bodies_are_found_again():
+    """All particles of both bubbles are moved away; without restarts, one bubble stays lost until it leaves."""
+    world = entry("eitbench/TwoBubbles2D-v0").world.with_changes(
+        {"vessel": {"truth_refinement": 1}, "schedule": {"scored_steps": 24}})
+    task, measured = make_task(world), cycle_voltages(world, 1, cached_episode(world, 1))
+    paths = world.target.paths(world, episode_streams(1).flow)
+    filters = BodyParticleFilter(body_model(task), 1)
+    distances = []
+    for k, (voltages, currents) in enumerate(zip(measured[:12], cycle(task.currents), strict=False), 1):
+        filters.assimilate(voltages[None], currents[None], np.isfinite(voltages)[None])
+        if k == 5:
+            filters.particles.centres[:] = [0.02, -0.03]
+        assert all(path.present[k] for path in paths)
+        centres = filters.summaries()[0, :, :2]
+        distances.append(max(np.linalg.norm(centres - path.centres[k], axis=1).min() for path in paths))
+    assert distances[4] > 0.1 and max(distances[7:]) < 0.025
 
 
 @pytest.mark.parametrize("id", [ID, SEARCH])
@@ -162,7 +176,7 @@ def test_belief_is_the_filter_inside(id):
     for pair in (7, 100, 3):
         core.act(np.array([pair]))
         belief.update({name: array[0] for name, array in core.observe().items()})
-        ours, inside = (each._filters.filter.bodies[0] for each in (belief, core))
+        ours, inside = (each._filters.filter for each in (belief, core))
         np.testing.assert_equal(ours.particles, inside.particles)
         np.testing.assert_array_equal(ours.weights, inside.weights)
 
@@ -177,11 +191,11 @@ def test_tracker_is_the_filter_of_an_episode():
         assert np.isnan(voltages).sum() == 12
         tracker.assimilate(voltages, currents)
         filters.assimilate(voltages[None], currents[None], world.instrument.measurement_mask(currents)[None])
-    (body,), estimate = filters.bodies, tracker.estimate()
-    index, share = filters.model.cells(body.particles)
+    estimate = tracker.estimate()
+    index, share = filters.model.cells(filters.particles)
     images = filters.model.images.toarray()[:, index[0]]
-    mean = np.einsum("p,pi,npi->n", body.weights[0], share[0], images)
-    second = body.weights[0] * body.particles.areas[0]
+    mean = np.einsum("p,pi,npi->n", filters.weights[0], share[0], images)
+    second = filters.weights[0] * filters.particles.areas[0, :, 0]
     square = np.einsum("p,pi,npi->n", second, share[0], images**2)
     np.testing.assert_allclose(estimate.mean, 30.0 + mean, rtol=1e-9)
     np.testing.assert_allclose(estimate.variance, square - mean**2, rtol=1e-6, atol=1e-9)

@@ -61,9 +61,9 @@ def test_truth_has_a_finer_electrode_mesh_on_request():
 def test_particles_move_with_the_flow_and_stay_in_the_pipe():
     """Velocities are relative to the flow; particles leave at the outlet, and absent ones enter at the inlet."""
     filters = BodyParticleFilter(body_model(make_task(BUBBLES)), 2, 4096)
-    (body,), model, random = filters.bodies, filters.model, np.random.default_rng(0)
-    before = body.particles
-    after, _ = model.move(before, body.weights, random)
+    model, random = filters.model, np.random.default_rng(0)
+    before = filters.particles
+    after, _ = model.move(before, filters.weights, random)
     velocity = (after.centres - before.centres) / DT - after.velocities
     inside = (np.abs(before.centres[..., 1]) < 0.03) & (before.centres[..., 0] < 0.35) & after.present
     y = before.centres[..., 1][inside]
@@ -72,9 +72,9 @@ def test_particles_move_with_the_flow_and_stay_in_the_pipe():
     shares = []
     for _ in range(400):
         filters.assimilate(*np.zeros((2, 2, 16)), np.zeros((2, 16), dtype=bool))
-        after = body.particles
-        shares.append(body.summary()[:, -1].mean())
-        moved = model.move(after, body.weights, random)[0]
+        after = filters.particles
+        shares.append(filters.summaries()[:, 0, -1].mean())
+        moved = model.move(after, filters.weights, random)[0]
         entered = ~after.present & moved.present
         assert (moved.centres[..., 0][entered] < 0.01 + 1.5 * DT).all()
         assert np.abs(moved.centres[..., 1]).max() <= R - 0.01 + 1e-12

@@ -9,7 +9,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from eitbench.data.episode_cache import scoring_constants
-from eitbench.estimation.body_particles import BodyParticles, measured_first
+from eitbench.estimation.body_particles import measured_first
 from eitbench.estimation.onboard.body_filters import BodyFilters
 from eitbench.estimation.onboard.electrode_faults import REJECTED_WEIGHT
 from eitbench.estimation.onboard.linearisation import Linearisation, linearisation_table
@@ -371,27 +371,20 @@ class BodyBelief:
         the voltages' covariance.
         """
         i, j = self._entries
-        covariance = np.zeros((self._functionals.shape[1],) * 2)
-        noise = self._variance
+        filters = self._filters.filter
         # the random numbers of the filter's next step are not known
-        random = np.random.default_rng(1)
-        for body in self._filters.filter.bodies:
-            mean, own = self._moments(body, random)
-            covariance = covariance + own
-            variance = np.diagonal(own)
-            square = variance[i] + variance[j] - 2.0 * own[i, j] + (mean[i] - mean[j])**2
-            noise = noise + body.model.motion.signal_error**2 * square
-        cross = covariance[:, -self._filters.patches.shape[0]:]
-        return pair_design_criteria(covariance, cross @ cross.T, self._entries, noise)
-
-    def _moments(self, body: BodyParticles,
-                 random: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-        """Return mean and covariance of the functionals of a body after the next step."""
-        particles, (weights,) = body.model.move(body.particles, body.weights, random)
-        index, shares = body.model.cells(particles)
-        cells = sp.csr_array((shares.ravel(), index.ravel(), np.arange(0, index.size + 1, 4)),
+        particles, (weights,) = filters.model.move(filters.particles, filters.weights,
+                                                   np.random.default_rng(1))
+        index, shares = filters.model.cells(particles)
+        cells = sp.csr_array((shares.ravel(), index.ravel(),
+                              np.arange(0, index.size + 1, index.shape[2])),
                              shape=(len(weights), len(self._functionals)))
         functionals = cells @ self._functionals
         mean = weights @ functionals
         deviation = functionals - mean
-        return mean, deviation.T @ (weights[:, None] * deviation)
+        covariance = deviation.T @ (weights[:, None] * deviation)
+        variance = np.diagonal(covariance)
+        square = variance[i] + variance[j] - 2.0 * covariance[i, j] + (mean[i] - mean[j])**2
+        noise = self._variance + filters.model.motion.signal_error**2 * square
+        cross = covariance[:, -self._filters.patches.shape[0]:]
+        return pair_design_criteria(covariance, cross @ cross.T, self._entries, noise)

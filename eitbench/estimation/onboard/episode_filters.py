@@ -46,17 +46,13 @@ class EpisodeFilters:
     rules : Rules
     frames : (B, K, L)
         Voltages in V of the first frame, the world's cycle.
-    faults : ElectrodeFaults, optional
-        Default: a new one if the rules prescribe that faults are estimated.
     """
 
-    def __init__(self, rules: Rules, frames: np.ndarray,
-                 faults: ElectrodeFaults | None = None) -> None:
+    def __init__(self, rules: Rules, frames: np.ndarray) -> None:
         B, _, L = frames.shape
         self._rules = rules
-        if faults is None and rules.faults == "estimated":
-            faults = ElectrodeFaults(rules.instrument, (B, L), rules.world.n_steps)
-        self.faults = faults
+        self.faults = (ElectrodeFaults(rules.instrument, (B, L), rules.world.n_steps)
+                       if rules.faults == "estimated" else None)
         """None: measurements beyond the gate are rejected"""
         self.table = linearisation_table(rules.world)
         self.indices = self._reference_indices(frames)

@@ -52,8 +52,6 @@ CATEGORY_TEXTS = {
 }
 """Class -> task."""
 HEADLINE_ENVIRONMENT, AGENT_ENVIRONMENT = "eitbench-Pipe2D-v0", "eitbench-Pipe2DInjectionBudget-v0"
-MULTIPLES = dict(enumerate(("two", "three", "four", "five", "six", "seven", "eight", "nine", "ten",
-                            "eleven", "twelve"), 2))
 HEADLINE = "media/headline.webp", "media/headline.png"
 """Animation of the first page, and its still picture, from the leaderboards' folder."""
 LINKS = {"Submit a method": "README.md", "Statistics": "../docs/statistics.md",
@@ -184,15 +182,15 @@ def index_page(site: Site) -> bytes:
 
 
 def headline(site: Site) -> dict[str, Any] | None:
-    """Return the errors ẽ_c of methods, the ratio of images without and with a flow model in words,
-    and the leaderboard; None without official records."""
+    """Return the errors ẽ_c of methods, the ratio of images without and with a flow model, rounded
+    down, and the leaderboard; None without official records."""
     board = site.board("filter", HEADLINE_ENVIRONMENT)
     errors = {row.cells["method"]: row.cells["error"] for row in (board.rows if board else ())
               if row.cells["official"] and row.complete}
     if not {"homogeneous", "gauss_newton", "extended_kalman_filter"} <= errors.keys():
         return None
-    multiple = MULTIPLES.get(int(errors["gauss_newton"] / errors["extended_kalman_filter"]))
-    return {"multiple": multiple, "errors": errors, "board": board} if multiple else None
+    ratio = int(errors["gauss_newton"] / errors["extended_kalman_filter"])
+    return {"ratio": ratio, "errors": errors, "board": board} if ratio > 1 else None
 
 
 # -- environments ----------------------------------------------------------------------------------
