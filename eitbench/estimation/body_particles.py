@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from copy import copy, deepcopy
 from functools import lru_cache
+from itertools import permutations
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -29,6 +30,8 @@ PARTICLES = 2048
 RESTART_STRIDE, RESTART_WEIGHT = 16, 1e-3
 """With several bodies, one of a particle's bodies jumps to any place in every 16th particle at each
 time step. These particles have this weight together, so that lost bodies are found again."""
+MAX_DISTANCE = 0.1
+"""m, largest distance between two estimates of a body, for the order of the bodies."""
 SEED = 0
 
 
@@ -242,6 +245,24 @@ class BodyParticleFilter:
                 each[b] = each[b].take(chosen, axis=0)
             self.particles.centres[b] += jitter
             self.weights[b] = 1.0 / P
+        if self.model.target.n_bodies > 1:
+            self._order_bodies()
+
+    def _order_bodies(self) -> None:
+        """Order the bodies of each particle as in the particle with the largest weight: particles
+        with different orders would have no mean positions."""
+        centres, _, _, present = self.particles
+        K = present.shape[2]
+        best = np.arange(len(centres))[:, None], self.weights.argmax(axis=1)[:, None]
+        reference, in_reference = centres[best][:, :, None], present[best][:, :, None]
+        distance = ((centres[..., None, :] - reference)**2).sum(axis=-1)            # (B, P, K, K)
+        cost = np.where(present[..., None] & in_reference, np.minimum(distance, MAX_DISTANCE**2),
+                        MAX_DISTANCE**2 * (present[..., None] ^ in_reference))
+        orders = np.array(list(permutations(range(K))))
+        order = orders[cost[:, :, orders, np.arange(K)].sum(axis=-1).argmin(axis=-1)]
+        self.particles = Particles(*(np.take_along_axis(
+            each, order.reshape(*order.shape, *(1,) * (each.ndim - 3)), axis=2)
+            for each in self.particles))
 
     def _densities(self) -> np.ndarray:
         """Return the posterior means (2, B, G) on the grid of the bodies' areas, and of their

@@ -65,13 +65,14 @@ def test_signals_are_those_of_the_complete_electrode_model(id, centre, limit):
 
 
 @pytest.mark.parametrize("id", [ID, TWO])
-def test_weights_are_those_of_bayes_formula(id):
+def test_weights_are_those_of_bayes_formula(id, monkeypatch):
     """One measurement from equal weights: the likelihood of each particle's voltages at the measured electrodes,
     relative to the density of the noise, and the moments of the innovation. Signals of bodies add up."""
     core, _ = believed(id)
     filters, rules = core._filters.filter, core.rules
     model = filters.model
-    model.move = lambda particles, weights, random: (particles, np.full_like(weights, 1.0 / weights.size))
+    monkeypatch.setattr(model, "move", lambda particles, weights, random: (
+        particles, np.full_like(weights, 1.0 / weights.size)))
     pair = 57
     (i, j), amplitude = rules.pairs[pair], rules.amplitude
     found, filters.reweight = [], lambda weights: found.append(weights[0])
@@ -80,7 +81,6 @@ def test_weights_are_those_of_bayes_formula(id):
     neighbours = {(k + step) % 16 for k in (i, j) for step in (-1, 1)}
     measured = sorted(neighbours - {i, j})
     std = model.noise_std(base)[measured]
-    del model.move
     index, weights = (each[0] for each in model.cells(filters.particles))
     change = np.einsum("kpc,pc->pk", model.signals[:, index], weights).reshape(-1, 16, 16)
     signals = amplitude * (change[:, :, i] - change[:, :, j])[:, measured]
@@ -119,6 +119,23 @@ def test_criteria_are_those_of_a_gaussian_of_images_and_voltages(id):
         S = joint[m:, m:] + R
         assert gains[pair] == pytest.approx(np.trace(joint[:m, m:] @ np.linalg.solve(S, joint[m:, :m])), rel=1e-6)
         assert information[pair] == pytest.approx(0.5 * np.linalg.slogdet(S @ np.linalg.inv(R))[1], rel=1e-6)
+
+
+def test_bodies_have_the_same_order_in_all_particles():
+    """The estimates do not depend on the order of the bodies in the particles, except in the most probable one."""
+    filters, random = BodyParticleFilter(body_model(make_task(rules_of(TWO).world)), 1), np.random.default_rng(0)
+    weights = np.ones(filters.n_particles)
+    weights[7] = 1.1
+    swapped = random.uniform(size=len(weights)) < 0.5
+    swapped[7] = False
+    filters.particles.present[0] = random.uniform(size=(len(weights), 2)) < 0.8
+    filters.particles.centres[0] = [[0.1, 0.02], [0.25, -0.02]] + 0.005 * random.standard_normal((len(weights), 2, 2))
+    other = filters.repeat(1)
+    for each in other.particles:
+        each[0, swapped] = each[0, swapped][:, ::-1]
+    for each in (filters, other):
+        each.reweight(weights[None] / weights.sum())
+    np.testing.assert_allclose(other.summaries(), filters.summaries(), rtol=1e-12)
 
 
 def test_body_has_the_moments_of_the_particles_that_are_present():
