@@ -124,7 +124,7 @@ class BodyModel:
             entering = ~present & (draw < PROPOSED_ENTRIES)
             ratio = np.where(entering, motion.enter / PROPOSED_ENTRIES,
                              (1.0 - motion.enter) / (1.0 - PROPOSED_ENTRIES))
-            weights = normalised(weights * np.where(present, 1.0, ratio).prod(axis=2))
+            weights = normalise(weights * np.where(present, 1.0, ratio).prod(axis=2))
             new = motion.entries(random, P * K), *self._draw_rest(random, P * K)
             centres, velocities, areas = (
                 np.where(entering.reshape(*entering.shape, *(1,) * (old.ndim - 3)),
@@ -145,7 +145,7 @@ class BodyModel:
             old[:, jumping, body] = new
         factor = np.full(P, (1.0 - RESTART_WEIGHT) / (1.0 - 1.0 / RESTART_STRIDE))
         factor[jumping] = RESTART_WEIGHT * RESTART_STRIDE
-        return normalised(weights * factor)
+        return normalise(weights * factor)
 
     def cells(self, particles: Particles) -> tuple[np.ndarray, np.ndarray]:
         """Return the grid points (B, P, 4 K) around the bodies of each particle, and their bilinear
@@ -225,7 +225,7 @@ class BodyParticleFilter:
         self.innovation = innovation, S, used
         log_weights = np.log(np.maximum(self.weights, 1e-300)) + log_likelihood
         weights = np.exp(log_weights - log_weights.max(axis=1, keepdims=True))
-        self.reweight(normalised(weights))
+        self.reweight(normalise(weights))
         scaled = np.zeros(voltages.shape)
         np.put_along_axis(scaled, electrodes, innovation / np.sqrt(
             S.diagonal(axis1=1, axis2=2)), axis=1)
@@ -311,7 +311,7 @@ class BodyParticleFilter:
                               axis=2)
 
 
-def normalised(weights: np.ndarray) -> np.ndarray:
+def normalise(weights: np.ndarray) -> np.ndarray:
     """Return weights (B, P) with a sum of one in each episode."""
     return np.asarray(weights / weights.sum(axis=1, keepdims=True))
 

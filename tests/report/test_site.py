@@ -293,7 +293,7 @@ def headlined(errors, official=True, **changes):
 def test_the_headline_is_computed(rendered):
     """The ratio of 37 and 4 is nine; key figures are skill scores of the best filter, trained agent and rule."""
     found = text_of(rendered(headlined(ERRORS))["index.html"])
-    for expected in ("A flow model reduces the error ninefold", "5.0 ×", "error of 0.037", "flow model 0.0040",
+    for expected in ("A flow model reduces the error 9-fold", "5.0 ×", "error of 0.037", "flow model 0.0040",
                      "9.2 times less", "3.0 times less in its square root", "image has 0.020", "test:0-1 of Pipe2"):
         assert expected in found, expected
     policies = {"ppo_seed0": 0.5, "ppo_seed1": 0.7, "rule": 0.8, "random_pair": 1.0}
@@ -307,9 +307,9 @@ def test_the_headline_is_computed(rendered):
 
 @pytest.mark.parametrize(("errors", "official"), [
     ({name: error for name, error in ERRORS.items() if name != "gauss_newton"}, True),
-    (ERRORS | {"gauss_newton": 0.006}, True), (ERRORS | {"gauss_newton": 0.9}, True), (ERRORS, False)])
+    (ERRORS | {"gauss_newton": 0.006}, True), (ERRORS, False)])
 def test_no_headline_where_it_would_not_be_true(errors, official, rendered):
-    """A missing method, a ratio out of range, or self-reported records give no headline."""
+    """A missing method, a ratio below two, or self-reported records give no headline."""
     records = headlined(errors, official)
     assert headline(collect(records)) is None and "<figure>" not in rendered(records)["index.html"]
 
