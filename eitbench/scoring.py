@@ -77,6 +77,60 @@ def spread_ratio(mean: np.ndarray, std: np.ndarray, truth: np.ndarray,
     return float(variance / np.average(((mean - truth)**2).mean(axis=0), weights=weights))
 
 
+def section_error(estimate: np.ndarray, truth: np.ndarray, section: np.ndarray,
+                  weights: np.ndarray) -> float:
+    """Compute the relative RMS error, over time and sections, of the means of nodal values (T, n)
+    in the sections of a pipe. ``section`` (n,) is the number of each node's section, ``weights``
+    (n,) its area or volume."""
+    estimate, truth = _pair(estimate, truth)
+    number, index = np.unique(section, return_inverse=True)
+    averages = np.zeros((len(number), len(index)))
+    averages[index, np.arange(len(index))] = weights
+    averages = averages[averages.any(axis=1)]
+    averages /= averages.sum(axis=1, keepdims=True)
+    means, true = averages @ estimate.T, averages @ truth.T
+    return math.sqrt(((means - true)**2).sum() / (true**2).sum())
+
+
+def slug_errors(estimated: np.ndarray, true: np.ndarray) -> tuple[float, float] | None:
+    """Compute the mean errors of arrival and duration, in steps, of the slugs in a ``true`` flow
+    through a section (T,) and an ``estimated`` one; None without a complete slug.
+
+    A slug is an interval in which the flow is above or below its median over time by more than half
+    of the largest true deviation. Its counterpart is the estimated slug of the same sign with
+    the largest overlap. An error is at most the true duration, which a missed slug has.
+    """
+    level = 0.5 * np.abs(true - np.median(true)).max()
+    found = _slugs(estimated, level)
+    errors = list[tuple[float, float]]()
+    for begin, end, sign in _slugs(true, level):
+        overlaps = [(min(end, other_end) - max(begin, other), other, other_end)
+                    for other, other_end, other_sign in found if other_sign == sign]
+        overlap, other, other_end = max(overlaps, default=(0.0, 0.0, 0.0))
+        most = end - begin
+        late, longer = abs(other - begin), abs(other_end - other - most)
+        errors.append((min(late, most), min(longer, most)) if overlap > 0 else (most, most))
+    if not errors:
+        return None
+    arrival, duration = np.mean(errors, axis=0)
+    return float(arrival), float(duration)
+
+
+def _slugs(flow: np.ndarray, level: float) -> list[tuple[float, float, int]]:
+    """Return begin and end, in steps, and the sign of each complete interval in which a flow (T,)
+    deviates from its median by more than ``level``, between linearly interpolated crossings."""
+    slugs = []
+    for sign in (1, -1):
+        above = sign * (flow - np.median(flow)) - level
+        inside = above > 0
+        before = np.flatnonzero(inside[1:] != inside[:-1])
+        crossings = before + above[before] / (above[before] - above[before + 1])
+        first = int(inside[0])                      # its begin was not observed
+        slugs += [(begin, end, sign)
+                  for begin, end in zip(crossings[first::2], crossings[first + 1::2], strict=False)]
+    return slugs
+
+
 def normalised_score(error: float, homogeneous: float, reference: float) -> float:
     """Compute (E_bh − E)/(E_bh − E_ref): 0 for the homogeneous estimate, 1 for the reference;
     higher is better."""

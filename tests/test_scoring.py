@@ -15,6 +15,8 @@ from eitbench.scoring import (
     normalised_score,
     ospa,
     relative_error,
+    section_error,
+    slug_errors,
     spread_ratio,
     step_errors,
     voltage_discrepancy,
@@ -194,3 +196,30 @@ def test_deficit_counts_only_what_is_lower_than_half():
     np.testing.assert_allclose(deficit_centroid(values, points, weights), (0.5, 0.5), atol=0.01)
     flat = np.full(len(points), 3.0)                                   # which has the centroid of the domain
     np.testing.assert_allclose(deficit_centroid(flat, points, weights), (1.0, 0.5), rtol=1e-12)
+
+
+@pytest.mark.parametrize(("late", "longer", "expected"), [
+    (0.0, 0.0, (0.0, 0.0)), (1.3, 0.0, (1.3, 0.0)), (-2.0, 3.0, (2.0, 3.0)), (30.0, 0.0, (8.0, 8.0)),
+])
+@pytest.mark.parametrize("sign", [1, -1])
+def test_slugs_of_a_piecewise_linear_flow(late, longer, expected, sign):
+    """Crossings at half height are exact; a slug that no estimate overlaps counts its duration; incomplete slugs do
+    not count."""
+    t = np.arange(100.0)
+
+    def flow(begin, duration):
+        knots = [begin - 4.0, begin + 4.0, begin + duration - 4.0, begin + duration + 4.0]
+        return 3.0 + sign * np.interp(t, [*knots, 95.0], [0.0, 1.0, 1.0, 0.0, 0.0])
+
+    found = slug_errors(flow(40.0 + late, 8.0 + longer), flow(40.0, 8.0))
+    assert found == pytest.approx(expected, abs=1e-9)
+    assert slug_errors(flow(40.0, 8.0), flow(-2.0, 8.0)) is None
+
+
+def test_section_error_averages_across_the_pipe():
+    """Errors that cancel within a section do not count; others are relative to the section's mean."""
+    truth, section, weights = np.full((3, 4), 2.0), np.array([0, 0, 7, 7]), np.array([1.0, 3.0, 2.0, 2.0])
+    cancelling = truth + np.array([3.0, -1.0, 1.0, -1.0])
+    assert section_error(cancelling, truth, section, weights) == pytest.approx(0.0, abs=1e-12)
+    assert section_error(truth + np.eye(4)[2], truth, section, weights) == pytest.approx(
+        0.5 / 2.0 / 2**0.5)

@@ -1,7 +1,7 @@
 """Compact table of all published episodes and their scores, generated from the records.
 
 The package ships it in place of hundreds of JSON files. A row is an episode. Scores are in SI units
-and have seven digits, computing times three; the records have all digits.
+and have five digits, computing times three; the records have all digits.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ def episode_table(records: Iterable[dict[str, Any]]) -> str:
     for record, episode in rows:
         environment = record["environment"]
         numbers = {name: None if value is None else
-                   f"{value:.{3 if name == 'seconds_per_step' else 7}g}"
+                   f"{value:.{3 if name == 'seconds_per_step' else 5}g}"
                    for name, value in episode.get("scores", {}).items()}
         writer.writerow(record | episode | numbers | {
             "id": environment["id"], "environment": environment["name"],

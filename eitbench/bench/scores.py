@@ -24,6 +24,8 @@ SCORE_DIRECTIONS = ("lower", "higher", "nominal", "none")
 """Direction in which a score improves; nominal: towards the value in its explanation."""
 LOST_DISTANCE = 0.04
 """m, distance beyond which a body counts as lost: more than its diameter"""
+N_SECTIONS = 40
+"""Number of equal sections along a pipe in which concentrations are averaged."""
 KINDS = (*TRACKS, "measured")
 """Tracks with simulated truth, and measurements of a real instrument."""
 
@@ -190,6 +192,19 @@ def _solute_amount_error(outcome: Any) -> float:
     return float(abs(estimated.sum() / true.sum() - 1.0))
 
 
+def _section_error(outcome: Any) -> float:
+    along = outcome.points[:, 0 if outcome.points.shape[1] == 2 else 2]
+    edges = np.linspace(along.min(), along.max(), N_SECTIONS + 1)
+    return scoring.section_error(outcome.mean, outcome.truth, np.digitize(along, edges[1:-1]),
+                                 outcome.weights)
+
+
+def _slug_error(outcome: Any, which: int) -> float | None:
+    """Error of arrival (0) or duration (1) in s."""
+    errors = scoring.slug_errors(*outcome.solute_flow)
+    return None if errors is None else outcome.world.time_step * errors[which]
+
+
 def _nis(outcome: Any) -> float | None:
     """Mean of νᵀS⁻¹ν/m over injections, with the m accepted measurements of each."""
     if outcome.innovations is None:
@@ -240,6 +255,17 @@ for _score in (
     Score("solute_amount_error", "amount error",
           "relative error of the amount of solute that leaves the pipe during the scored states",
           _solute_amount_error, requires=("solute_flow",)),
+    Score("section_error", "section error",
+          f"relative RMS error of the mean concentration in each of {N_SECTIONS} equal sections "
+          "along the pipe",
+          _section_error, requires=("solute_flow", "mean", "truth")),
+    Score("arrival_error", "arrival",
+          "mean error of the arrival of slugs at the outlet, ms; a missed slug counts its duration",
+          lambda outcome: _slug_error(outcome, 0), requires=("solute_flow",), factor=1e3),
+    Score("duration_error", "duration",
+          "mean error of the duration of slugs at the outlet, ms; a missed slug counts its "
+          "duration",
+          lambda outcome: _slug_error(outcome, 1), requires=("solute_flow",), factor=1e3),
     Score("position_error", "position",
           "median distance between the estimated and the true position of a body, mm",
           lambda outcome: float(np.median(outcome.distances)), requires=("distances",),

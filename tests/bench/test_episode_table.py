@@ -19,16 +19,16 @@ RESULTS = bundled_path("leaderboards") / "results"
 
 def test_the_published_table_agrees_with_the_records():
     """`eitbench leaderboard --records leaderboards/results` would not change it, and `load` returns the same data, with
-    seven digits, and three of the times."""
+    five digits, and three of the times."""
     text = lzma.decompress((RESULTS.parent / TABLE_NAME).read_bytes()).decode()
     records = read_records(RESULTS)
     assert text == episode_table(records), "run `eitbench leaderboard --records leaderboards/results`"
     shipped, full = load(RESULTS.parent / "none"), load()
     pd.testing.assert_frame_equal(shipped, full, check_exact=False, rtol=5e-3, atol=0.0)
     times = full["metric"] == "seconds_per_step"
-    pd.testing.assert_frame_equal(shipped[~times], full[~times], check_exact=False, rtol=6e-7, atol=0.0)
+    pd.testing.assert_frame_equal(shipped[~times], full[~times], check_exact=False, rtol=6e-5, atol=0.0)
     exact = anchors(records)
-    assert bundled_anchors(records) == {key: pytest.approx(errors, rel=6e-7) for key, errors in exact.items()}
+    assert bundled_anchors(records) == {key: pytest.approx(errors, rel=6e-5) for key, errors in exact.items()}
 
 
 def test_published_records_name_no_folder_of_a_machine():
@@ -51,13 +51,13 @@ def test_records_come_back(tmp_path):
             assert all(other[name] == one[name] for name in other if name != "scores")
             assert ("scores" in one) == ("scores" in other)
             known = {name: value for name, value in one.get("scores", {}).items() if value is not None}
-            assert other.get("scores", {}) == pytest.approx(known, rel=6e-7)
+            assert other.get("scores", {}) == pytest.approx(known, rel=6e-5)
     assert [len(group) for group in split_outdated(read)] == [len(group) for group in split_outdated(written)]
     for each in written:
         write_record(tmp_path / "json", each)
     listed, order = load(tmp_path / "results"), ["environment", "method", "version", "seed", "metric"]
     pd.testing.assert_frame_equal(listed.sort_values(order, ignore_index=True),
-                                  load(tmp_path / "json").sort_values(order, ignore_index=True), rtol=6e-7)
+                                  load(tmp_path / "json").sort_values(order, ignore_index=True), rtol=6e-5)
 
 
 def test_compare_needs_no_records(tmp_path, monkeypatch):

@@ -45,7 +45,12 @@ def outcome(**given):
      {"nis": 2.0, "velocity_error": 0.01}),
     # flows (3, 6) mol/s of true (4, 3): RMS √(10/25), amount 9 of 7
     ("estimation", {"solute_flow": (np.array([3.0, 6.0]), np.array([4.0, 3.0]))},
-     {"solute_flow_error": 0.4**0.5, "solute_amount_error": 2 / 7}),
+     {"solute_flow_error": 0.4**0.5, "solute_amount_error": 2 / 7, "arrival_error": None,
+      # one section: estimates 2.75 and 4 of the mean concentration 2.5
+      "section_error": (0.25**2 + 1.5**2)**0.5 / (2 * 2.5**2)**0.5}),
+    # a slug is estimated one step late, and ends in time
+    ("estimation", {"solute_flow": (np.array([0.0, 0, 0, 2, 0, 0, 0]), np.array([0.0, 0, 2, 2, 0, 0, 0]))},
+     {"arrival_error": WORLD.time_step, "duration_error": WORLD.time_step}),
     # distances 1, 3 and 50 mm: the median is 3 mm, and a third of the states are lost
     ("injection", {"distances": np.array([0.001, 0.05, 0.003]), "ospa": 0.02},
      {"position_error": 0.003, "lost_fraction": 1 / 3, "ospa": 0.02}),
@@ -104,7 +109,7 @@ def test_a_new_score_is_shown_everywhere(apart, records):
 @pytest.mark.parametrize("name", ["nis", "voltage_discrepancy", "beauty"])
 def test_only_scores_with_a_direction_are_compared(name, records):
     """The message lists the scores that can."""
-    with pytest.raises(ValueError, match=f"score must be one of error, .*got '{name}'"):
+    with pytest.raises(ValueError, match=f"score must be one of .*_error.*; got '{name}'"):
         compare.compare(records[1:], records[1:], name)
 
 
