@@ -23,7 +23,7 @@ class Policy(CyclePolicy):
                   "Pipe2DDriftingVelocity": [[7, 8], [1, 7]], "RotatingTank2D": [[9, 15]],
                   "TankTracking": ROTATION, "SearchAndTrack": [[4, 13], [3, 14], [0, 10]],
                   "BubbleTracking": [[2, 10], [4, 12], [2, 10]],
-                  "TwoBubbleTracking": [[3, 9], [1, 10]]},
+                  "TwoBubbleTracking": [[2, 9], [1, 12], [3, 8]]},
         "environment_steps": {
             "Pipe2D": 346_368, "Pipe2D with faults": 608_768,
             "Pipe2D with estimated faults": 467_072,
@@ -31,7 +31,7 @@ class Policy(CyclePolicy):
             "Pipe2DIntermittent with a budget and a fitted inflow prior": 768_768,
             "Pipe2DDriftingVelocity": 217_792,
             "RotatingTank2D": 333_696, "TankTracking": 712_704, "SearchAndTrack": 712_704,
-            "BubbleTracking": 1_127_424, "TwoBubbleTracking": 476_160}}
+            "BubbleTracking": 1_127_424, "TwoBubbleTracking": 546_816}}
 
     @classmethod
     def suits(cls, rules: Rules) -> bool:

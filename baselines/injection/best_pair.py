@@ -17,7 +17,7 @@ class Policy(CyclePolicy):
                  "Pipe2DDriftingVelocity": [7, 9],
                  "RotatingTank2D": [9, 15], "TankTracking": [8, 14],
                  "SearchAndTrack": [2, 12], "BubbleTracking": [2, 10],
-                 "TwoBubbleTracking": [3, 9]},
+                 "TwoBubbleTracking": [2, 9]},
         "environment_steps": {
             "Pipe2D": 314_880, "Pipe2D with faults": 314_880,
             "Pipe2D with estimated faults": 314_880,
