@@ -1,11 +1,11 @@
 """Choice of injections in measured data: `python studies/measured_injection.py ktc-1 ktc-2 ktc-3
-ktc-4`, twenty minutes.
+ktc-4`, twenty minutes, and the same with `kit4-2.3 kit4-4.1 kit4-4.4`.
 
 A policy chooses one of the measured injections after the other, without repetition; the estimate is
 the one of log_map, from the chosen injections only. The table has the RMS error of predictions of
-all other injections, in standard deviations of the noise, and the challenge's score of the
-segmentation, after each number of injections; both are means over the cases. Noise and prior of the
-task are fitted to all measurements of a file.
+all other injections, in standard deviations of the noise, and, where the truth is known, the
+challenge's score of the segmentation, after each number of injections; both are means over the
+cases. Noise and prior of the task are fitted to all measurements of a file.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ class Frame:
     Parameters
     ----------
     name : str
-        Name of a case with a stationary target and a truth.
+        Name of a case with a stationary target.
     """
 
     def __init__(self, name: str) -> None:
@@ -66,13 +66,16 @@ class Frame:
                             self.std[chosen], self.penalty, start)
 
     def score(self, chosen: list[int], u: np.ndarray) -> tuple[float, float]:
-        """Return the RMS error of the other injections in standard deviations, and KTC's score."""
+        """Return the RMS error of the other injections in standard deviations, and KTC's score, NaN
+        without a truth."""
         others = np.setdiff1d(np.arange(len(self.steps)), chosen)
         predicted = self.estimator.voltages(u, self.currents[others])
         residual = (self.voltages[others] - predicted) / self.std[others]
+        rms = float(np.sqrt(np.nanmean(residual**2)))
+        if self.truth is None:
+            return rms, np.nan
         c = self.env.task.expected_concentration * np.exp(u)
-        return (float(np.sqrt(np.nanmean(residual**2))),
-                ktc_score(self.truth, segment(self.env.vessel, self.env.task, c)))
+        return rms, ktc_score(self.truth, segment(self.env.vessel, self.env.task, c))
 
     def whitened(self, u: np.ndarray) -> np.ndarray:
         """Return the derivatives (K, M, r) of all measurements by the modes, over the noise."""
@@ -154,8 +157,8 @@ def main() -> None:
           + "---:|" * len(COUNTS))
     for policy in tqdm(POLICIES, disable=None):
         table = np.mean([scores_of(frame, policy) for frame in frames], axis=0)
-        print(f"| {policy} | " + " | ".join(f"{rms:.1f}, {ktc:.2f}" for rms, ktc in table) + " |",
-              flush=True)
+        texts = [f"{rms:.1f}" if np.isnan(ktc) else f"{rms:.1f}, {ktc:.2f}" for rms, ktc in table]
+        print(f"| {policy} | {' | '.join(texts)} |", flush=True)
 
 
 if __name__ == "__main__":

@@ -55,8 +55,8 @@ def draw_electrodes(axes: Axes, task: Task, currents: np.ndarray, width: float =
     cem = task.observation.cem
     for facets, current in zip(cem.electrodes, currents, strict=True):
         colour = IDLE if current == 0 else SOURCE if current > 0 else SINK
-        bars = 100 * cem.mesh.points[facets]
-        if cem.mesh.dim == 3:
+        bars = 100 * cem.mesh.points[facets][..., :task.mesh.dim]
+        if task.mesh.dim == 3:
             x, y, z = bars.reshape(-1, 3).T
             if x.min() > -1e-6 or x.max() < 1e-6:
                 continue

@@ -7,6 +7,7 @@ Shapes: F frames, K injections, M measurements per injection, L electrodes.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from scipy.optimize import least_squares, nnls
@@ -106,6 +107,11 @@ def calibrate(electrodes: CompleteElectrodeModel, currents: np.ndarray, matrix: 
         x = (ln ρ, mean of ln ζ_l, deviations of the ln ζ_l from this mean), with the resistivity
         ρ = 1/σ and contacts ζ_l = z_l σ.
         """
+        return at(x.tobytes())
+
+    @lru_cache(maxsize=1)           # residuals and Jacobian are asked for one after the other
+    def at(numbers: bytes) -> tuple[np.ndarray, np.ndarray]:
+        x = np.frombuffer(numbers)
         contacts = np.exp(x[1] + x[2:])
         vessel = electrodes.with_contacts(contacts)
         R, by_contact = vessel.contact_derivatives(np.ones(vessel.mesh.n_nodes))

@@ -61,6 +61,8 @@ def read(path: Path | str, format: str | None = None, steps: slice | None = None
 
 
 def _detect_format(path: Path) -> str:
+    if path.suffix == ".dat" or (path.is_dir() and any(path.glob("*.dat"))):
+        return "unified"
     if path.is_dir() or path.suffix == ".eit":
         return "sciospec"
     if path.suffix in (".h5", ".hdf5"):
@@ -70,8 +72,8 @@ def _detect_format(path: Path) -> str:
         return "ktc" if names & set(load_variables(path)) else "eidors"
     if path.suffix in (".csv", ".tsv", ".txt"):
         return "table"
-    raise ValueError(f"{path} must end in .h5, .mat, .eit, .csv, .tsv or .txt, or format must be "
-                     f"one of {', '.join(READERS)}")
+    raise ValueError(f"{path} must end in .h5, .mat, .eit, .dat, .csv, .tsv or .txt, or format "
+                     f"must be one of {', '.join(READERS)}")
 
 
 def read_sciospec(path: Path, *, frequency: float | None = None) -> Measurements:
@@ -169,6 +171,63 @@ def _read_frame(path: Path, frequency: float | None) -> tuple[
                          "numbers with decimal points, two for each channel")
     return (time, (frequency, amplitude, mode == DIFFERENTIAL, pairs.tolist()),
             parts[:, :2 * count:2])
+
+
+def read_unified(path: Path, *, current: float = 1.0, frame_time: float = 1.0) -> Measurements:
+    """Read one ``.dat`` file of pyGIMLi's unified data format, or all files of a folder in the
+    order of their names, each a frame with the same electrodes.
+
+    A row holds the electrodes ``a``, ``b`` of the current and ``m``, ``n`` of the voltage, from 1,
+    and the resistance ``r`` in Ω. Rows whose entry ``valid`` is 0 are missing. The files state
+    neither the current nor times: voltages are for ``current`` in A, and frames follow
+    each other after ``frame_time`` in s.
+    """
+    _check.number("current", current, low=0.0, open_low=True, units="A")
+    _check.number("frame_time", frame_time, low=0.0, open_low=True, units="s")
+    files = sorted(path.glob("*.dat")) if path.is_dir() else [path]
+    counts, frames = zip(*map(_read_unified_frame, files), strict=True)
+    L = counts[0]
+    if wrong := [file for file, count in zip(files, counts, strict=True) if count != L]:
+        raise ValueError(f"{wrong[0]} must have the {L} electrodes of {files[0]}")
+    rows = np.concatenate([pairs for pairs, _ in frames])
+    injections, injection = np.unique(rows[:, :2], axis=0, return_inverse=True)
+    channels, channel = np.unique(rows[:, 2:], axis=0, return_inverse=True)
+    F, K = len(files), len(injections)
+    voltages = np.full((F, K, len(channels)), np.nan)
+    frame = np.repeat(np.arange(F), [len(pairs) for pairs, _ in frames])
+    voltages[frame, injection.ravel(), channel.ravel()] = current * np.concatenate(
+        [resistance for _, resistance in frames])
+    positive, negative = np.eye(L)[channels.T - 1]
+    times = frame_time * (np.arange(F)[:, None] + np.arange(K) / K)
+    return Measurements(
+        _pair_currents(injections, current, L), np.tile(np.arange(K), F), positive - negative,
+        voltages.reshape(F * K, -1), times.ravel(),
+        source=provenance(path, frames=F, assumed=f"{current:g} A, a frame in {frame_time:g} s"))
+
+
+def _read_unified_frame(path: Path) -> tuple[int, tuple[np.ndarray, np.ndarray]]:
+    """Return the number of electrodes L, the electrodes a, b, m, n (N, 4) from 1, and the
+    resistances (N,) in Ω, NaN where invalid."""
+    try:
+        lines = path.read_text(encoding="utf-8").splitlines()
+        content = [line for line in lines if line.strip() and not line.lstrip().startswith("#")]
+        L = int(content[0].partition("#")[0])
+        N = int(content[L + 1].partition("#")[0])
+        head = next(line for line in reversed(lines[:lines.index(content[L + 2])])
+                    if line.startswith("#"))
+        names = head.lstrip("#").lower().split()
+        table = np.array([line.split()[:len(names)] for line in content[L + 2:L + 2 + N]], float)
+        columns = dict(zip(names, table.T, strict=True))
+        pairs = np.stack([columns[name] for name in "abmn"], axis=1).astype(int)
+        resistance = np.where(columns.get("valid", 1.0) == 0, np.nan, columns["r"])
+    except (OSError, ValueError, IndexError, StopIteration, KeyError) as error:
+        raise ValueError(f"{path} must have pyGIMLi's unified format: the number of electrodes and "
+                         "their positions, the number of rows, a line such as '# a b m n r', and "
+                         f"the rows ({type(error).__name__}: {error})") from None
+    if pairs.min() < 1 or pairs.max() > L:
+        raise ValueError(f"{path}: a, b, m and n must be electrodes from 1 to {L}, got "
+                         f"{pairs.min()} to {pairs.max()}")
+    return L, (pairs, resistance)
 
 
 def read_table(path: Path, *, electrodes: int, current: float, time_step: float = 1.0,
@@ -302,4 +361,4 @@ def load_yaml(path: Path, subject: str) -> dict[str, Any]:
 
 READERS: dict[str, Callable[..., Measurements]] = {
     "hdf5": Measurements.load, "ktc": read_ktc, "eidors": read_eidors,
-    "sciospec": read_sciospec, "table": read_table}
+    "sciospec": read_sciospec, "unified": read_unified, "table": read_table}

@@ -80,7 +80,7 @@ def task_from_measurements(vessel: VesselConfig, calibration: Calibration,
     mean, model = calibration.mean_voltages, calibration.model_voltages
     corrects_offset, corrects_gain = (calibration.correction == each for each in ("offset", "gain"))
     observation: Any = MeasurementModel(                # estimators require a `VoltageModel` only
-        ObservationModel(cem, mesh.interpolation_to(cem.mesh.points),
+        ObservationModel(cem, mesh.interpolation_to(cem.mesh.points[:, :mesh.dim]),
                          LinearConductivity(molar_conductivity), 1e-3 * background),
         measurements.currents, calibration.gain * measurements.matrix, vessel.depth,
         offset=np.nan_to_num(mean - model) if corrects_offset else 0.0,

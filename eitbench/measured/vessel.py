@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from eitbench import _check
+from eitbench.measured.boreholes import BoreholePlane
 from eitbench.measured.measurements import file_sha256
 from eitbench.measured.readers import load_yaml
 from eitbench.numerics.mesh import Mesh
@@ -25,6 +26,7 @@ VESSEL_ENTRIES = {
     "rectangle": ({"length", "width", "electrodes"}, {"electrode_width", "cover", "depth", "flow"}),
     "cylinder": ({"length", "radius", "rings", "electrodes", "height", "cover"},
                  {"first", "direction", "flow"}),
+    "boreholes": ({"positions", "depths"}, {"electrode_size"}),
     "mesh": ({"file", "electrodes"}, {"scale", "depth"}),
 }
 """Kind of vessel -> required and optional entries; each may also have ``conductivity``."""
@@ -58,13 +60,13 @@ class VesselConfig:
     Angles are counter-clockwise: 0° is to the right, 90° at the top of a picture.
     """
 
-    shape: RoundTank | PlanePipe | RoundPipe | MeshVessel
+    shape: RoundTank | PlanePipe | RoundPipe | BoreholePlane | MeshVessel
     first_electrode_deg: float = 0.0
     """angle of the middle of the first electrode"""
     direction: str = "counter-clockwise"
     """direction in which electrodes are numbered"""
     depth: float = 1.0
-    """m of fluid for a plane model; 1 in 3D"""
+    """m of fluid for a plane model; 1 in 3D; 2 for boreholes, whose model is one symmetric half"""
     conductivity: float | None = None
     """S/m if specified; then the gain of the instrument is calibrated"""
     flow: FlowConfig | None = None
@@ -126,6 +128,8 @@ def read_vessel(source: Path | str | Mapping[str, Any]) -> VesselConfig:
       ``electrodes`` (total number), ``electrode_width`` or ``cover``, [``depth``, ``flow``]
     - cylinder, a pipe with rings of electrodes: ``length``, ``radius``, ``rings``, ``electrodes``
       (number per ring), ``height`` of an electrode, ``cover``, [``first``, ``direction``, ``flow``]
+    - boreholes in a plane: ``positions`` and ``depths`` of a grid of electrodes,
+      [``electrode_size``]; see `BoreholePlane`
     - mesh: ``file``, ``electrodes`` (number), [``scale``, ``depth``]; see `MeshVessel`
 
     and for all [``conductivity``] in S/m, if known. ``flow`` has the entries of `FlowConfig`.
@@ -152,10 +156,15 @@ def read_vessel(source: Path | str | Mapping[str, Any]) -> VesselConfig:
             raise ValueError("vessel.flow must have mean_velocity (m/s), and may have "
                              f"{', '.join(names[1:])}, got {flow!r}")
         options["flow"] = FlowConfig(**flow)
+    if kind == "boreholes":
+        options["depth"] = 2.0
     return VesselConfig(_shape(kind, entries, folder), **options)
 
 
 def _shape(kind: str, entries: dict[str, Any], folder: Path) -> Any:
+    if kind == "boreholes":
+        size = entries.get("electrode_size", BoreholePlane.electrode_size)
+        return BoreholePlane(tuple(entries["positions"]), tuple(entries["depths"]), size)
     count = _check.integer("vessel.electrodes", entries["electrodes"], low=2)
     if kind == "circle":
         tank = RoundTank(radius=entries["radius"], n_electrodes=count)
