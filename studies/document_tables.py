@@ -1,8 +1,8 @@
 """Tables of the environments and of the built-in estimators in docs/.
 
-`python studies/document_tables.py` writes them into docs/environments.md, docs/estimators.md and
-docs/methods.md, from the registered environments and leaderboards/leaderboard.csv, in half a
-minute.
+`python studies/document_tables.py` writes them into docs/environments.md, docs/estimators.md,
+docs/methods.md and docs/pipe2d.md, from the registered environments and
+leaderboards/leaderboard.csv, in half a minute.
 """
 
 from pathlib import Path
@@ -15,6 +15,7 @@ from eitbench.bench.table import Table, number_cell
 from eitbench.bench.tracks import builtin_ids, subtrack_of
 from eitbench.envs.episodes import EpisodeEnv
 from eitbench.physics.stationary import StationaryTransport
+from eitbench.report.boards import columns
 
 ROOT = Path(__file__).resolve().parent.parent
 COLUMNS = {
@@ -28,6 +29,11 @@ WITHOUT_FLOW = {"back_projection": "BP", "noser": "NOSER", "total_variation": "T
                 "gauss_newton": "GN", "random_walk_filter": "walk",
                 "temporal_regularisation": "temporal"}
 """Method without a flow model -> column of its table."""
+PLANT = ("Pipe2D", "Pipe2DSmoothing")
+PLANT_SCORES = ("error", "solute_flow_error", "solute_amount_error", "section_error",
+                "arrival_error", "duration_error")
+MS = ("arrival_error", "duration_error")
+"""Scores in ms."""
 THESIS = ("kalman_filter", "fixed_lag_smoother", "fixed_interval_smoother")
 ASSUMPTIONS = {
     "homogeneous": ("–", "one constant"),
@@ -155,10 +161,24 @@ def methods() -> str:
     return Table.of(rows).markdown()
 
 
+def plant() -> str:
+    """Return the table of the scores of flows and slugs in `PLANT`, by the error of the flow."""
+    known = columns()
+    scores = leaderboard()
+    rows = []
+    for id in PLANT:
+        own = scores[(scores["environment"] == id) & scores["solute_flow_error"].notna()]
+        for _, row in own.sort_values("solute_flow_error").iterrows():
+            rows.append({"environment": id, "method": row["method"]} | {
+                known[name][0]: number_cell((1e3 if name.endswith(MS) else 1.0) * row[name])
+                for name in PLANT_SCORES})
+    return Table.of(rows).markdown()
+
+
 def main() -> None:
     """Write the tables between their markers."""
     for name, made in (("environments", environments()), ("estimators", estimators()),
-                       ("methods", methods())):
+                       ("methods", methods()), ("pipe2d", plant())):
         path = ROOT / "docs" / f"{name}.md"
         before, rest = path.read_text(encoding="utf-8").split("<!-- table -->\n")
         after = rest.partition("\n<!-- end -->")[2]

@@ -22,7 +22,7 @@ OUTER_CELLS = 5
 """Cells of the electrode model between the boreholes and the ends of the ground."""
 EXTENT = 1.0
 """Distance of the ends of the ground from the electrodes, relative to the size of their grid."""
-MARGIN_CELLS, MAX_CELLS = 4, 60
+MARGIN_CELLS, MAX_CELLS = 4, 40
 """Cells of the mesh of estimates beyond the electrodes, and along a side of their grid at most."""
 
 
@@ -62,8 +62,8 @@ class BoreholePlane:
     def transport_mesh(self, fine: bool) -> tuple[Mesh, np.ndarray]:
         """Return the mesh of estimates in the plane, in (position, −depth), and no inlet."""
         sides = np.ptp(self.positions), self.depths[-1]
-        cell = max(sides) / MAX_CELLS
-        cell = max(cell, 0.25 * min(np.diff(self.positions).min(), np.diff(self.depths).min()))
+        spacing = min(np.diff(self.positions).min(), np.diff(self.depths).min())
+        cell = max(max(sides) / MAX_CELLS, 0.5 * spacing)
         x = np.arange(round(sides[0] / cell) + 1 + 2 * MARGIN_CELLS) - MARGIN_CELLS
         y = np.arange(round(sides[1] / cell) + 1 + MARGIN_CELLS)
         return (rectangle_mesh(self.positions[0] + sides[0] * x / (x[-1] - MARGIN_CELLS),
