@@ -9,14 +9,14 @@ import pytest
 
 ROOT = Path(__file__).parent.parent
 PACKAGE = ROOT / "eitbench"
-BUDGETS = {"numerics": 1658, "scoring": 196, "physics": 1681, "worlds": 2761, "data": 1485, "estimation": 6643,
-           "measured": 1917, "envs": 1683, "bench": 4639, "report": 2741, "rl": 848, "cli": 1013}
+BUDGETS = {"numerics": 1658, "scoring": 196, "physics": 1687, "worlds": 2761, "data": 1485, "estimation": 6643,
+           "measured": 2088, "envs": 1683, "bench": 4639, "report": 2741, "rl": 848, "cli": 1013}
 """Package (or module) -> lines of Python allowed, blank lines and docstrings included. Each imports only from those
 before it."""
 TOP = 433
 """Lines allowed in the other modules at the top: public names, argument checks, files, messages."""
 BASELINES = 2188
-TESTS = 19_423
+TESTS = 19_570
 MODULES = {".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__"): path
            for path in PACKAGE.rglob("*.py")}
 
