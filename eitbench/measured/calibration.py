@@ -109,7 +109,7 @@ def calibrate(electrodes: CompleteElectrodeModel, currents: np.ndarray, matrix: 
         """
         return at(x.tobytes())
 
-    @lru_cache(maxsize=1)           # residuals and Jacobian are asked for one after the other
+    @lru_cache(maxsize=1)           # residuals and Jacobian need the same point
     def at(numbers: bytes) -> tuple[np.ndarray, np.ndarray]:
         x = np.frombuffer(numbers)
         contacts = np.exp(x[1] + x[2:])
