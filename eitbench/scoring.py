@@ -86,7 +86,6 @@ def section_error(estimate: np.ndarray, truth: np.ndarray, section: np.ndarray,
     number, index = np.unique(section, return_inverse=True)
     averages = np.zeros((len(number), len(index)))
     averages[index, np.arange(len(index))] = weights
-    averages = averages[averages.any(axis=1)]
     averages /= averages.sum(axis=1, keepdims=True)
     means, true = averages @ estimate.T, averages @ truth.T
     return math.sqrt(((means - true)**2).sum() / (true**2).sum())

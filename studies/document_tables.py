@@ -11,11 +11,11 @@ import gymnasium as gym
 import numpy as np
 import pandas as pd
 
+from eitbench.bench.scores import scores
 from eitbench.bench.table import Table, number_cell
 from eitbench.bench.tracks import builtin_ids, subtrack_of
 from eitbench.envs.episodes import EpisodeEnv
 from eitbench.physics.stationary import StationaryTransport
-from eitbench.report.boards import columns
 
 ROOT = Path(__file__).resolve().parent.parent
 COLUMNS = {
@@ -32,8 +32,6 @@ WITHOUT_FLOW = {"back_projection": "BP", "noser": "NOSER", "total_variation": "T
 PLANT = ("Pipe2D", "Pipe2DSmoothing")
 PLANT_SCORES = ("error", "solute_flow_error", "solute_amount_error", "section_error",
                 "arrival_error", "duration_error")
-MS = ("arrival_error", "duration_error")
-"""Scores in ms."""
 THESIS = ("kalman_filter", "fixed_lag_smoother", "fixed_interval_smoother")
 ASSUMPTIONS = {
     "homogeneous": ("–", "one constant"),
@@ -132,10 +130,10 @@ def leaderboard() -> pd.DataFrame:
 
 def estimators() -> str:
     """Return the table of all built-in estimators: assumptions, cost and errors."""
-    scores = leaderboard()
+    table = leaderboard()
     rows = []
     for method, (flow, inflow) in ASSUMPTIONS.items():
-        own = scores[scores["method"] == method].set_index("environment").reindex(COLUMNS)
+        own = table[table["method"] == method].set_index("environment").reindex(COLUMNS)
         seconds = own["seconds_per_step"].dropna()
         rows.append({
             "method": method, "flow": flow, "inflow or image": inflow,
@@ -146,11 +144,11 @@ def estimators() -> str:
 
 def methods() -> str:
     """Return the table of the errors without a flow model, with the thesis' and the best one."""
-    scores = leaderboard()
+    table = leaderboard()
     rows = []
-    estimated = scores.loc[~scores["class"].isin(("injection", "measured")), "environment"]
+    estimated = table.loc[~table["class"].isin(("injection", "measured")), "environment"]
     for id in (name for name in map(base_name, builtin_ids()) if name in set(estimated)):
-        own = scores[scores["environment"] == id].set_index("method")
+        own = table[table["environment"] == id].set_index("method")
         best = own.loc[own["rank"].notna(), "error"].idxmin()
         errors = {column: own["error"].get(name, np.nan)
                   for name, column in WITHOUT_FLOW.items()}
@@ -163,15 +161,11 @@ def methods() -> str:
 
 def plant() -> str:
     """Return the table of the scores of flows and slugs in `PLANT`, by the error of the flow."""
-    known = columns()
-    scores = leaderboard()
-    rows = []
-    for id in PLANT:
-        own = scores[(scores["environment"] == id) & scores["solute_flow_error"].notna()]
-        for _, row in own.sort_values("solute_flow_error").iterrows():
-            rows.append({"environment": id, "method": row["method"]} | {
-                known[name][0]: number_cell((1e3 if name.endswith(MS) else 1.0) * row[name])
-                for name in PLANT_SCORES})
+    shown = [scores()[name] for name in PLANT_SCORES]
+    found = leaderboard().dropna(subset="solute_flow_error").sort_values("solute_flow_error")
+    rows = [{"environment": id, "method": row["method"]} | {
+                score.heading: number_cell(score.factor * row[score.name]) for score in shown}
+            for id in PLANT for _, row in found[found["environment"] == id].iterrows()]
     return Table.of(rows).markdown()
 
 

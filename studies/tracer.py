@@ -16,7 +16,9 @@ from thesis.common import save_figure
 
 from eitbench.bench.runner import run_on_measurements
 from eitbench.envs.measured import MeasuredEnv, case_env
+from eitbench.numerics.fem import mass_matrix
 from eitbench.numerics.mesh import Mesh
+from eitbench.scoring import deficit_centroid
 
 ROOT = Path(__file__).parents[1]
 FRAMES = (5, 8, 11, 14, 17, 20)
@@ -46,9 +48,10 @@ def draw(mesh: Mesh, relative: np.ndarray) -> None:
     """Draw the conductivities (frames, n) relative to the background, and print centroids."""
     figure = Figure(figsize=(10.5, 3.6), dpi=110, layout="constrained")
     panels = figure.subplots(2, 3, sharex=True, sharey=True)
+    areas = mass_matrix(mesh).sum(axis=0)
     shape = Triangulation(*mesh.points.T, mesh.cells)
     for axes, frame, values in zip(panels.flat, FRAMES, relative, strict=True):
-        x, y = tracer_centroid(mesh, values)
+        x, y = deficit_centroid(-values, mesh.points, areas)
         print(f"frame {frame}: tracer at {x:.2f} m, {-y:.2f} m deep", flush=True)
         drawn = axes.tripcolor(shape, np.log(np.clip(values, *LIMITS)), shading="gouraud",
                                vmin=np.log(LIMITS[0]), vmax=np.log(LIMITS[1]))
@@ -62,15 +65,6 @@ def draw(mesh: Mesh, relative: np.ndarray) -> None:
     ticks = np.array([0.3, 0.5, 1.0, 2.0, 3.0])
     bar.set_ticks(np.log(ticks), labels=[f"{tick:g}" for tick in ticks])
     save_figure(figure, ROOT / "docs" / "tracer.png")
-
-
-def tracer_centroid(mesh: Mesh, values: np.ndarray) -> np.ndarray:
-    """Return the centroid (2,) in m of the excess conductivity, where it is above half of its
-    largest value."""
-    excess = np.maximum(values - 1.0, 0.0)
-    counted = np.where(excess > 0.5 * excess.max(), excess, 0.0)
-    centroid: np.ndarray = counted @ mesh.points / counted.sum()
-    return centroid
 
 
 if __name__ == "__main__":

@@ -9,7 +9,7 @@ import pytest
 
 ROOT = Path(__file__).parent.parent
 PACKAGE = ROOT / "eitbench"
-BUDGETS = {"numerics": 1658, "scoring": 196, "physics": 1687, "worlds": 2761, "data": 1485, "estimation": 6643,
+BUDGETS = {"numerics": 1658, "scoring": 195, "physics": 1687, "worlds": 2761, "data": 1485, "estimation": 6647,
            "measured": 2088, "envs": 1683, "bench": 4639, "report": 2741, "rl": 848, "cli": 1013}
 """Package (or module) -> lines of Python allowed, blank lines and docstrings included. Each imports only from those
 before it."""

@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from eitbench.numerics.fem import mass_matrix
+from eitbench.numerics.mesh import Mesh
 from eitbench.worlds.task import make_task
 from eitbench.worlds.world import World
 
@@ -85,21 +86,8 @@ class LinearisationTable:
 
     @cached_property
     def grid_averages(self) -> np.ndarray:
-        """(patches, n) averages over the boxes of the vessel's grid along x and y, x first, with
-        nodes weighted by the mass matrix. ``ValueError`` if a box has no node."""
-        grid = self.world.vessel.coarse_grid_shape
-        points = self.task.mesh.points[:, :2]
-        low = points.min(axis=0)
-        high = points.max(axis=0)
-        position = (points - low) / (high - low) * grid
-        column, row = np.minimum(position, np.array(grid) - 1).astype(int).T
-        averages = np.zeros((grid[0] * grid[1], len(points)))
-        nodal_mass = mass_matrix(self.task.mesh).sum(axis=0)
-        averages[row * grid[0] + column, np.arange(len(points))] = nodal_mass
-        if not averages.any(axis=1).all():
-            raise ValueError(f"the task's mesh must have a node in each of {grid[0]} × {grid[1]} "
-                             "boxes of the vessel")
-        return averages / averages.sum(axis=1, keepdims=True)
+        """`box_averages` of the task's mesh on the vessel's grid."""
+        return box_averages(self.task.mesh, self.world.vessel.coarse_grid_shape)
 
     def noise_std(self, voltages: np.ndarray, noise_floor: float) -> np.ndarray:
         """Return the noise (V) that filters assume at predicted voltages (..., L).
@@ -119,6 +107,22 @@ class LinearisationTable:
         resistance, table = self.task.observation.resistance_derivatives(
             np.full(self.task.mesh.n_nodes, c))
         return Linearisation(resistance, c * np.ascontiguousarray(np.moveaxis(table, 0, 2)))
+
+
+def box_averages(mesh: Mesh, grid: tuple[int, int]) -> np.ndarray:
+    """Return averages (boxes, n) over the boxes of a grid along x and y, x first, with nodes
+    weighted by the mass matrix. ``ValueError`` if a box has no node."""
+    points = mesh.points[:, :2]
+    low = points.min(axis=0)
+    high = points.max(axis=0)
+    position = (points - low) / (high - low) * grid
+    column, row = np.minimum(position, np.array(grid) - 1).astype(int).T
+    averages = np.zeros((grid[0] * grid[1], len(points)))
+    averages[row * grid[0] + column, np.arange(len(points))] = mass_matrix(mesh).sum(axis=0)
+    if not averages.any(axis=1).all():
+        raise ValueError(f"mesh must have a node in each of {grid[0]} × {grid[1]} "
+                         "boxes of the vessel")
+    return averages / averages.sum(axis=1, keepdims=True)
 
 
 _table = lru_cache(maxsize=2)(LinearisationTable)
