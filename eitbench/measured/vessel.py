@@ -164,7 +164,9 @@ def read_vessel(source: Path | str | Mapping[str, Any]) -> VesselConfig:
 def _shape(kind: str, entries: dict[str, Any], folder: Path) -> Any:
     if kind == "boreholes":
         size = entries.get("electrode_size", BoreholePlane.electrode_size)
-        return BoreholePlane(tuple(entries["positions"]), tuple(entries["depths"]), size)
+        positions, depths = (tuple(np.atleast_1d(entries[name]).tolist())
+                             for name in ("positions", "depths"))
+        return BoreholePlane(positions, depths, size)
     count = _check.integer("vessel.electrodes", entries["electrodes"], low=2)
     if kind == "circle":
         tank = RoundTank(radius=entries["radius"], n_electrodes=count)

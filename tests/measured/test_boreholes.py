@@ -44,6 +44,7 @@ def test_potentials_are_those_of_point_sources(monkeypatch):
 
 @pytest.mark.parametrize(("changes", "message"), [
     ({"positions": [0.0]}, r"positions must be two or more numbers .* got \(0.0,\)"),
+    ({"positions": 3.0}, r"positions must be two or more numbers .* got \(3.0,\)"),
     ({"depths": [0.4, 0.2]}, "depths must be two or more numbers"),
     ({"depths": [0.0, 0.2]}, "depths below the surface"),
     ({"electrode_size": 0.0}, "electrode_size must be"),
