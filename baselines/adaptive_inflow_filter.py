@@ -1,10 +1,10 @@
-"""Extended Kalman filter with an inflow of unknown variance, q times the value of thesis Table 5.1
-(after Myers & Tapley, IEEE Trans. Autom. Control 21, 1976).
+"""Extended Kalman filter with an inflow of unknown variance.
 
-The inflow is white noise, and the state holds the inflows of a residence time. If the square of a
-correction K ν exceeds its expectation tr(K S Kᵀ), q is too small: ln q changes by RATE times the
-relative excess, at most MAX_EXCESS. RATE was chosen on training episodes by
-`studies/tune_random_walk.py`.
+The variance is q times the value of thesis Table 5.1; q is estimated (after Myers & Tapley, IEEE
+Trans. Autom. Control 21, 1976). The inflow is white noise, and the state holds the inflows of a
+residence time. If the square of a correction K ν exceeds its expectation tr(K S Kᵀ), q is too
+small: ln q changes by RATE times the relative excess, at most MAX_EXCESS. RATE was chosen on
+training episodes by `studies/tune_random_walk.py`.
 """
 
 import numpy as np
@@ -34,6 +34,7 @@ class AdaptiveFilter:
         self.log_q = 0.0
         self.filter = Filter(self.space, linearise_at_prediction(task))
         self.estimate = self.filter.estimate
+        self.covariance_of = self.filter.covariance_of
 
     def assimilate(self, voltages: np.ndarray, currents: np.ndarray) -> None:
         """Predict, condition on voltages (L,) in V for an injection (L,) in A, and change q."""

@@ -30,8 +30,8 @@ WITHOUT_FLOW = {"back_projection": "BP", "noser": "NOSER", "total_variation": "T
                 "temporal_regularisation": "temporal"}
 """Method without a flow model -> column of its table."""
 PLANT = ("Pipe2D", "Pipe2DSmoothing")
-PLANT_SCORES = ("error", "solute_flow_error", "solute_amount_error", "section_error",
-                "arrival_error", "duration_error")
+PLANT_SCORES = ("error", "solute_flow_error", "solute_flow_coverage_90", "solute_amount_error",
+                "section_error", "energy_score", "arrival_error", "duration_error")
 THESIS = ("kalman_filter", "fixed_lag_smoother", "fixed_interval_smoother")
 ASSUMPTIONS = {
     "homogeneous": ("–", "one constant"),

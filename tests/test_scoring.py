@@ -10,12 +10,12 @@ from eitbench.scoring import (
     coverage,
     crps,
     deficit_centroid,
+    energy_score,
     matched_distances,
     normalised_innovations,
     normalised_score,
     ospa,
     relative_error,
-    section_error,
     slug_errors,
     spread_ratio,
     step_errors,
@@ -216,10 +216,28 @@ def test_slugs_of_a_piecewise_linear_flow(late, longer, expected, sign):
     assert slug_errors(flow(40.0, 8.0), flow(-2.0, 8.0)) is None
 
 
-def test_section_error_averages_across_the_pipe():
-    """Errors that cancel within a section do not count; others are relative to the section's mean."""
-    truth, section, weights = np.full((3, 4), 2.0), np.array([0, 0, 7, 7]), np.array([1.0, 3.0, 2.0, 2.0])
-    cancelling = truth + np.array([3.0, -1.0, 1.0, -1.0])
-    assert section_error(cancelling, truth, section, weights) == pytest.approx(0.0, abs=1e-12)
-    assert section_error(truth + np.eye(4)[2], truth, section, weights) == pytest.approx(
-        0.5 / 2.0 / 2**0.5)
+@pytest.mark.parametrize("std", [0.0, 0.4, 2.0])
+def test_energy_score_of_one_number_is_its_crps(std):
+    """The fixed draws cause a deviation of 3 % of the standard deviation."""
+    mean, truth = np.linspace(-1.0, 1.0, 50)[:, None], np.zeros((50, 1))
+    expected = crps(mean, np.full_like(mean, std), truth, np.ones(1))
+    assert energy_score(mean, np.full((50, 1, 1), std**2), truth) == pytest.approx(expected, abs=0.03 * std + 1e-12)
+
+
+def test_energy_score_is_best_for_the_true_covariance():
+    """Independent draws give the same number, and a wrong scale or correlation a larger one; twice as large an unit
+    doubles the score."""
+    rng = np.random.default_rng(3)
+    P = 0.1 * np.eye(4) + np.outer(np.ones(4), np.ones(4))
+    truth = rng.multivariate_normal(np.zeros(4), P, 4000)
+    mean = np.zeros_like(truth)
+
+    def score(covariance, factor=1.0):
+        return energy_score(mean, np.broadcast_to(factor**2 * covariance, (4000, 4, 4)), factor * truth)
+
+    x, other = rng.multivariate_normal(np.zeros(4), P, (2, 4000))
+    expected = (np.linalg.norm(x - truth, axis=1).mean() - 0.5 * np.linalg.norm(x - other, axis=1).mean()) / 2
+    assert score(P) == pytest.approx(expected, rel=0.03)
+    assert all(score(P) < score(wrong) for wrong in (0.4 * P, 2.5 * P, np.diag(P.diagonal())))
+    assert score(P, 2.0) == pytest.approx(2.0 * score(P), rel=1e-12)
+    assert score(np.outer(np.ones(4), np.ones(4))) == pytest.approx(score(P), rel=0.1)      # of rank one

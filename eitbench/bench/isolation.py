@@ -367,6 +367,10 @@ class Worker:
         arrays = self._ask("update", voltages=voltages, currents=currents)[1]
         return Estimate(**arrays) if arrays else None
 
+    def covariance_of(self, functionals: np.ndarray) -> np.ndarray | None:
+        """Return the estimator's covariance of linear functionals, if it has one."""
+        return self._ask("covariance_of", functionals=functionals)[1].get("covariance")
+
     def act(self, observation: Mapping[str, np.ndarray]) -> Any:
         """Return the policy's action."""
         action = self._ask("act", **observation)[1].get("action", np.zeros(0))
@@ -582,6 +586,11 @@ class _MethodServer:
                              f"{type(estimate).__name__}")
         return {name: np.asarray(value) for name, value in estimate._asdict().items()
                 if value is not None}
+
+    def covariance_of(self, functionals: np.ndarray) -> dict[str, Any]:
+        """Return the estimator's covariance of linear functionals, if it has one."""
+        known = getattr(self._instance, "covariance_of", lambda functionals: None)(functionals)
+        return {} if known is None else {"covariance": np.asarray(known)}
 
     def act(self, **observation: np.ndarray) -> dict[str, Any]:
         """Return the policy's action."""

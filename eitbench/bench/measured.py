@@ -23,9 +23,9 @@ class MeasuredRun:
     """Estimates of a method, and their residuals, t = 1 … T."""
 
     def __init__(self, env: MeasuredEnv, method: str,
-                 steps: Iterable[tuple[int, Estimate | None, dict[str, np.ndarray], float]],
+                 steps: Iterable[tuple[int, Estimate | None, dict[str, np.ndarray], float, Any]],
                  kept: Collection[int] | None = None) -> None:
-        """Collect (t, estimate, measurement, seconds) step by step; store the estimates at the
+        """Collect (t, estimate, measurement, seconds, …) step by step; store the estimates at the
         steps ``kept``, by default all."""
         T, velocity = env.episode_steps, env.task.velocity
         self.method = method
@@ -41,7 +41,7 @@ class MeasuredRun:
         stored: dict[int, tuple[np.ndarray, np.ndarray | None]] = {}
         seconds = 0.0
         mean = before = np.empty(0)
-        for t, estimate, _, elapsed in steps:
+        for t, estimate, _, elapsed, _ in steps:
             assert estimate is not None
             seconds += elapsed
             mean = np.array(estimate.mean, dtype=float)

@@ -17,7 +17,7 @@ from eitbench import _check, scoring
 from eitbench.bench.isolation import Worker
 from eitbench.bench.measured import MeasuredRun
 from eitbench.bench.methods import Method, load_method
-from eitbench.bench.scores import LOST_DISTANCE, Outcome
+from eitbench.bench.scores import LOST_DISTANCE, N_SECTIONS, Outcome
 from eitbench.bench.tracks import Environment, check_track, is_measured, subtrack_of
 from eitbench.data.episode_cache import region_operators, truth_mesh
 from eitbench.data.episodes import cached_truth_model, simulate
@@ -33,8 +33,9 @@ from eitbench.worlds.registry import entry
 from eitbench.worlds.task import Estimate, Task
 from eitbench.worlds.world import World
 
-Step = tuple[int, Estimate | None, dict[str, np.ndarray], float]
-"""t of the estimate, the estimate, the last voltages and currents, and the computing time in s."""
+Step = tuple[int, Estimate | None, dict[str, np.ndarray], float, np.ndarray | None]
+"""t of the estimate, the estimate, the last voltages and currents, the computing time in s, and the
+covariance of its functionals (`Functionals`)"""
 
 
 class EpisodeRun(NamedTuple):
@@ -114,6 +115,39 @@ def run_estimator(env: EstimationEnv, estimator: Method, seed: int) -> EpisodeRu
     return EpisodeRun(output.outcome(env), output.currents, output.fields())
 
 
+class Functionals(NamedTuple):
+    """Linear functionals of the concentration in a pipe; an estimator may return their covariance
+    (``docs/concepts.md``)."""
+
+    true_sections: np.ndarray
+    """(q, n_truth) mean of each of `N_SECTIONS` equal sections, of a concentration of the truth"""
+    sections: np.ndarray
+    """(q, n) the same, of an estimate"""
+    flows: np.ndarray
+    """(k, n) m³/s (m²/s in 2D): flow of solute through the outlet, or derivatives of it by the k
+    parameters of the flow"""
+
+
+@lru_cache(maxsize=4)
+def functionals_of(env: EstimationEnv) -> Functionals | None:
+    """Return the functionals of an environment; None without a flow through the vessel."""
+    task, model = env.task, env.task.transport
+    if not (isinstance(model, ConvectionDiffusion) and model.inlet.size):
+        return None
+    interpolation, mass = region_operators(env.world)
+    points = truth_mesh(env.world).points
+    along = points[:, 0 if points.shape[1] == 2 else 2]
+    edges = np.linspace(along.min(), along.max(), N_SECTIONS + 1)
+    _, section = np.unique(np.digitize(along, edges[1:-1]), return_inverse=True)
+    averages = np.zeros((section.max() + 1, len(points)))
+    averages[section, np.arange(len(points))] = np.asarray(mass.sum(axis=0)).ravel()
+    averages /= averages.sum(axis=1, keepdims=True)
+    outlet = outlet_of(model)
+    fields = task.velocity.basis_fields if task.velocity else [model.velocity]
+    flows = np.array([outlet.flow_weights(field) for field in fields])
+    return Functionals(averages, averages @ interpolation, flows)
+
+
 class EstimatorOutput:
     """Outputs and inputs of an estimator in one episode of T steps, collected step by step."""
 
@@ -124,12 +158,16 @@ class EstimatorOutput:
         """(T, n) (mol/m³)², NaN in states without a variance"""
         self.velocities = np.tile(task.velocity.nominal if task.velocity else (), (task.n_steps, 1))
         """(T, k) parameters of the flow in m/s; k = 0 if the task specifies the flow"""
+        self.velocity_variances = np.zeros_like(self.velocities)
+        """(T, k) m²/s²; 0 if not reported"""
+        self.covariances: dict[int, np.ndarray] = {}
+        """t -> covariance (q + k, q + k) of `Functionals.sections` and `Functionals.flows`"""
         self.innovations: dict[int, tuple[np.ndarray, np.ndarray]] = {}
         """i of a measurement vector -> ν (L,) in V and S (L, L) in V²"""
         self.seconds: list[float] = []
         """computing time of each update in s; the first includes the constructor"""
         measured = []
-        for t, estimate, measurement, elapsed in steps:
+        for t, estimate, measurement, elapsed, covariance in steps:
             measured.append(measurement)
             self.seconds.append(elapsed)
             if estimate is None:
@@ -140,6 +178,10 @@ class EstimatorOutput:
                     self.variances[t - 1] = estimate.variance
                 if estimate.velocity is not None:
                     self.velocities[t - 1] = estimate.velocity
+                if estimate.velocity_variance is not None:
+                    self.velocity_variances[t - 1] = estimate.velocity_variance
+                if covariance is not None:
+                    self.covariances[t] = covariance
             if estimate.innovation is not None and estimate.innovation_covariance is not None:
                 # copies: a method may reuse its arrays
                 self.innovations[t + task.lag] = (
@@ -189,28 +231,35 @@ class EstimatorOutput:
             mean=mean, truth=truth, mass=mass,
             points=truth_mesh(env.world).points, homogeneous=homogeneous,
             voltages_measured=self.voltages[states], voltages_predicted=computed,
-            innovations=innovations, std=std, velocity=velocity,
-            solute_flow=_solute_flow(env, truth, self.means[states], self.velocities[states]))
+            innovations=innovations, std=std, velocity=velocity, **self._flow_fields(env, truth))
 
-
-def _solute_flow(env: EstimationEnv, states: np.ndarray, means: np.ndarray,
-                 velocities: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
-    """Return the estimated and the true flow of solute through the outlet (S,) in mol/s, for the
-    scored ``states`` (S, n_truth), their estimates (S, n) and flow parameters (S, k); None without
-    a flow through the vessel."""
-    task, world = env.task, env.world
-    model, truth = task.transport, cached_truth_model(world).transport
-    if not (isinstance(model, ConvectionDiffusion) and isinstance(truth, ConvectionDiffusion)
-            and model.inlet.size):
-        return None
-    drawn = world.flow.draw(world, episode_streams(env.core.seeds[0]).flow)
-    outlet, true_outlet = outlet_of(model), outlet_of(truth)
-    estimated = [outlet.solute_flow(mean, task.velocity.field(parameters) if task.velocity
-                                    else model.velocity)
-                 for mean, parameters in zip(means, velocities, strict=True)]
-    true = [true_outlet.solute_flow(concentration, drawn(t) if drawn else truth.velocity)
-            for t, concentration in enumerate(states, task.warm_up + 1)]
-    return np.array(estimated), np.array(true)
+    def _flow_fields(self, env: EstimationEnv, truth: np.ndarray) -> dict[str, Any]:
+        """Return the fields of the outcome on sections and outlet of a pipe, with the ``truth``
+        (S, n_truth) of the scored states; none without a flow through the vessel."""
+        task, world, functionals = env.task, env.world, functionals_of(env)
+        if functionals is None:
+            return {}
+        states = slice(task.warm_up, None)
+        means = self.means[states]
+        model: Any = cached_truth_model(world).transport
+        outlet, velocity = outlet_of(model), model.velocity
+        drawn = world.flow.draw(world, episode_streams(env.core.seeds[0]).flow)
+        true = np.array([outlet.flow_weights(drawn(t) if drawn else velocity) @ concentration
+                         for t, concentration in enumerate(truth, task.warm_up + 1)])
+        parts = means @ functionals.flows.T
+        theta = self.velocities[states] if task.velocity else np.ones_like(parts)
+        fields: dict[str, Any] = {
+            "solute_flow": ((parts * theta).sum(axis=1), true),
+            "sections": (means @ functionals.sections.T, truth @ functionals.true_sections.T)}
+        if all(t in self.covariances for t in range(task.warm_up + 1, task.n_steps + 1)):
+            covariances = np.array([self.covariances[t] for t in sorted(self.covariances)])
+            q = len(functionals.sections)
+            fields["section_covariance"] = covariances[:, :q, :q]
+            variance = np.einsum("tk,tkl,tl->t", theta, covariances[:, q:, q:], theta)
+            if task.velocity:       # the correlation of velocity and concentration is neglected
+                variance += (parts**2 * self.velocity_variances[states]).sum(axis=1)
+            fields["solute_flow_std"] = np.sqrt(variance)
+        return fields
 
 
 def _run_policy(env: InjectionEnv, policy: Method, seed: int) -> EpisodeRun:
@@ -287,14 +336,14 @@ def iter_estimates(env: EstimationEnv, estimator: Method,
                    seed: int) -> Iterator[tuple[int, Estimate]]:
     """Yield (t, estimate of the state t ≥ 1) in one episode. The estimator receives the task and
     the measurements, but neither rewards nor the environment."""
-    for t, estimate, _, _ in _iter_steps(env, estimator, seed):
+    for t, estimate, *_ in _iter_steps(env, estimator, seed):
         if estimate is not None and t >= 1:
             yield t, estimate
 
 
 def _iter_steps(env: EstimationEnv | MeasuredEnv, estimator: Method, seed: int,
                 ) -> Iterator[Step]:
-    """Yield (t = i − lag, estimate, measurement i, computing time in s) at each step i."""
+    """Yield a `Step` for each measurement i, with t = i − lag."""
     with allow_test_seeds():
         observation, _ = env.reset(seed=seed)
     shown: list[Any] = [env.task]
@@ -306,6 +355,7 @@ def _iter_steps(env: EstimationEnv | MeasuredEnv, estimator: Method, seed: int,
     player = estimator.make(*shown)
     setup = time.perf_counter() - begin
     silence = Estimate(np.full(env.task.mesh.n_nodes, env.task.expected_concentration))
+    functionals = functionals_of(env) if isinstance(env, EstimationEnv) else None
     t = -env.task.lag
     done = False
     while not done:
@@ -322,12 +372,19 @@ def _iter_steps(env: EstimationEnv | MeasuredEnv, estimator: Method, seed: int,
             _check_estimate(estimate, env.task, np.isfinite(seen["voltages"]))
             if estimate.variance is not None and isinstance(env, EstimationEnv):
                 env.core.estimate_std = np.sqrt(estimate.variance)
+        covariance = None
+        if functionals is not None and t > env.task.warm_up and hasattr(player, "covariance_of"):
+            rows = np.concatenate([functionals.sections, functionals.flows])
+            covariance = player.covariance_of(rows)
+            if covariance is not None:
+                covariance = _check.array("Estimator.covariance_of(functionals)", covariance,
+                                          (len(rows), len(rows)))
         answer = silence if estimate is None else estimate
         action = answer.mean
         if (flow := env.task.velocity) is not None:
             action = np.append(action, flow.nominal if answer.velocity is None else answer.velocity)
         observation, _, done, _, _ = env.step(action)
-        yield t, estimate, seen, seconds
+        yield t, estimate, seen, seconds, covariance
 
 
 def _check_estimate(estimate: Any, task: Task, measured: np.ndarray) -> None:

@@ -66,6 +66,12 @@ class Outcome:
     """(S, p) estimated and true m/s, and weights (p,), where the task includes the flow"""
     solute_flow: tuple[np.ndarray, np.ndarray] | None = None
     """(S,) estimated and true flow of solute through a pipe's outlet, mol/s (mol/(s·m) in 2D)"""
+    solute_flow_std: np.ndarray | None = None
+    """(S,) standard deviation of the estimated flow, if reported in every scored state"""
+    sections: tuple[np.ndarray, np.ndarray] | None = None
+    """(S, q) estimated and true mean concentration of each of `N_SECTIONS` sections, mol/m³"""
+    section_covariance: np.ndarray | None = None
+    """(S, q, q) (mol/m³)², covariance of the former, if reported in every scored state"""
     distances: np.ndarray | None = None
     """m, between the estimated and the true position of each body in each scored state"""
     ospa: float | None = None
@@ -182,8 +188,7 @@ def _velocity_error(outcome: Any) -> float:
     return scoring.relative_error(estimated, true, np.diag(weights))
 
 
-def _solute_flow_error(outcome: Any) -> float:
-    estimated, true = outcome.solute_flow
+def _relative_rms(estimated: np.ndarray, true: np.ndarray) -> float:
     return float(np.sqrt(((estimated - true)**2).sum() / (true**2).sum()))
 
 
@@ -192,11 +197,10 @@ def _solute_amount_error(outcome: Any) -> float:
     return float(abs(estimated.sum() / true.sum() - 1.0))
 
 
-def _section_error(outcome: Any) -> float:
-    along = outcome.points[:, 0 if outcome.points.shape[1] == 2 else 2]
-    edges = np.linspace(along.min(), along.max(), N_SECTIONS + 1)
-    return scoring.section_error(outcome.mean, outcome.truth, np.digitize(along, edges[1:-1]),
-                                 outcome.weights)
+def _solute_flow_coverage(outcome: Any) -> float:
+    estimated, true, std = (each[:, None] for each in
+                            (*outcome.solute_flow, outcome.solute_flow_std))
+    return scoring.coverage(estimated, std, true, np.ones(1), 0.9)
 
 
 def _slug_error(outcome: Any, which: int) -> float | None:
@@ -251,14 +255,23 @@ for _score in (
           _velocity_error, requires=("velocity",)),
     Score("solute_flow_error", "flow error",
           "relative RMS error of the solute flow through the outlet, ∫ĉ v̂·n against ∫c v·n",
-          _solute_flow_error, requires=("solute_flow",)),
+          lambda outcome: _relative_rms(*outcome.solute_flow), requires=("solute_flow",)),
+    Score("solute_flow_coverage_90", "flow 90 %",
+          "fraction of time in which the reported 90 % interval of the solute flow through the "
+          "outlet contains the truth",
+          _solute_flow_coverage, direction="nominal", requires=("solute_flow_std",)),
     Score("solute_amount_error", "amount error",
           "relative error of the amount of solute that leaves the pipe during the scored states",
           _solute_amount_error, requires=("solute_flow",)),
     Score("section_error", "section error",
           f"relative RMS error of the mean concentration in each of {N_SECTIONS} equal sections "
           "along the pipe",
-          _section_error, requires=("solute_flow", "mean", "truth")),
+          lambda outcome: _relative_rms(*outcome.sections), requires=("sections",)),
+    Score("energy_score", "energy score",
+          "energy score of the joint density of the mean concentrations in these sections, mol/m³",
+          lambda outcome: scoring.energy_score(outcome.sections[0], outcome.section_covariance,
+                                               outcome.sections[1]),
+          requires=("section_covariance",)),
     Score("arrival_error", "arrival",
           "mean error of the arrival of slugs at the outlet, ms; a missed slug counts its duration",
           lambda outcome: _slug_error(outcome, 0), requires=("solute_flow",), factor=1e3),

@@ -142,3 +142,7 @@ class EnsembleFilter:
         c, theta = self.concentration, self.parameters
         return Estimate(c.mean(axis=1), c.var(axis=1, ddof=1), *self._innovation)._replace(
             velocity=theta.mean(axis=1), velocity_variance=theta.var(axis=1, ddof=1))
+
+    def covariance_of(self, functionals: np.ndarray, lag: int = 0) -> np.ndarray:
+        """Return the covariance (m, m) of ``functionals`` (m, n) of the present concentration."""
+        return np.atleast_2d(np.cov(functionals @ self.concentration))

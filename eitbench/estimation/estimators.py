@@ -119,6 +119,12 @@ class FilterEstimator(SequentialEstimator):
             return estimate._replace(velocity=None, velocity_variance=None)
         return estimate
 
+    def covariance_of(self, functionals: np.ndarray) -> np.ndarray | None:
+        """Return the covariance (m, m) of ``functionals`` (m, n) of the concentration that `update`
+        returned last; None during the calibration frame, and for filters without one."""
+        known = getattr(self.filter, "covariance_of", None)
+        return None if known is None else known(functionals, self.measured - self._requested)
+
 
 class RecordSmoother:
     """Smoother of a complete measurement sequence, for `FilterEstimator` in the smoothing subtrack.

@@ -41,6 +41,16 @@ class StateSpace:
         """Return the variances (n,) of the concentration in (mol/m³)²."""
         return covariance.diagonal()
 
+    def covariance_of(self, functionals: np.ndarray, mean: np.ndarray, covariance: Covariance,
+                      lag: int = 0) -> np.ndarray | None:
+        """Return the covariance (m, m) of ``functionals`` (m, n) of the concentration in mol/m³;
+        None if it is unknown for this lag."""
+        if lag:
+            return None
+        J = self.jacobian(mean, functionals)
+        found: np.ndarray = J @ covariance.times(J.T)[:J.shape[1]]
+        return found
+
     def constrain(self, mean: np.ndarray) -> np.ndarray:
         """Return the nearest admissible mean after a measurement."""
         return mean
@@ -169,6 +179,11 @@ class Filter:
             self.step.innovation, self.step.innovation_covariance)
         return Estimate(space.concentration(self.mean, lag),
                         space.variance(self.mean, self.covariance, lag), *innovation, *velocity)
+
+    def covariance_of(self, functionals: np.ndarray, lag: int = 0) -> np.ndarray | None:
+        """Return the covariance (m, m) of ``functionals`` (m, n) of the concentration ``lag`` steps
+        before the present; None if it is unknown for this lag."""
+        return self.space.covariance_of(functionals, self.mean, self.covariance, lag)
 
 
 def kalman_filter(start: Filter, observations: Iterable[LinearMeasurement]) -> list[Step]:

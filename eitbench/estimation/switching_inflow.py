@@ -117,6 +117,13 @@ class SwitchingInflowFilter:
         return Estimate(mean, self.probabilities @ (variances + (means - mean)**2),
                         *self._innovation)
 
+    def covariance_of(self, functionals: np.ndarray, lag: int = 0) -> np.ndarray:
+        """Return the covariance (m, m) of ``functionals`` (m, n) of the present concentration."""
+        values = np.array([each.concentration for each in self.filters]) @ functionals.T
+        apart = values - self.probabilities @ values
+        within = np.array([each.covariance_of(functionals) for each in self.filters])
+        return np.tensordot(self.probabilities, within, 1) + (self.probabilities * apart.T) @ apart
+
 
 class ParticleInflowFilter(SwitchingInflowFilter):
     """Rao–Blackwellised particle filter of the two regimes; a particle is a regime sequence.

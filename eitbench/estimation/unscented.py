@@ -67,6 +67,12 @@ class UnscentedFilter(Filter):
         estimate = super().estimate()
         return estimate._replace(mean=mean, variance=estimate.variance + (bend**2).sum(axis=1))
 
+    def covariance_of(self, functionals: np.ndarray, lag: int = 0) -> np.ndarray:
+        known = super().covariance_of(functionals)
+        assert known is not None
+        bend = functionals @ moments(self._sigma_points()[0])[2]
+        return known + bend @ bend.T
+
 
 def moments(values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return mean (m,) of a function of k independent standard normal numbers, its derivatives

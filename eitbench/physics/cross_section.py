@@ -26,10 +26,11 @@ class Outlet(NamedTuple):
     interpolation: sp.csr_array
     """(q, n) from nodal values to the points"""
 
-    def solute_flow(self, concentration: np.ndarray, velocity: VelocityField) -> float:
-        """Compute ∫ c v·n over the outlet in mol/s (mol/(s·m) in 2D) for (n,) in mol/m³."""
+    def flow_weights(self, velocity: VelocityField) -> np.ndarray:
+        """Compute (n,) weights in m³/s (m²/s in 2D) of nodal values c in mol/m³ whose sum is
+        ∫ c v·n over the outlet in mol/s (mol/(s·m) in 2D)."""
         volume = (velocity(self.points) * self.normals).sum(axis=1)
-        return float(volume @ (self.interpolation @ concentration))
+        return np.asarray(volume @ self.interpolation)
 
 
 @lru_cache(maxsize=4)

@@ -77,7 +77,8 @@ def write_fields(folder):
 
 @pytest.mark.parametrize(("environment", "kind", "write"), [
     (FIXED_LAG, "process", write_fields), (INJECTION, KIND, write_policy),
-    (FILTER, KIND, lambda _: "homogeneous")], ids=["lag", "injection", "built-in"])
+    (FILTER, KIND, lambda _: "homogeneous"), (FILTER, "process", lambda _: "log_inflow_filter")],
+    ids=["lag", "injection", "built-in", "joint covariance"])
 def test_scores_are_identical(environment, kind, write, tmp_path, monkeypatch):
     """Test an estimator that reports every field, a policy that depends on its random numbers, and
     a built-in method by name; one worker runs both episodes. The state of a policy's generator,
@@ -89,7 +90,8 @@ def test_scores_are_identical(environment, kind, write, tmp_path, monkeypatch):
     for seed in (1, 2):
         (here, fields), (there, others) = (run_episode(Job(environment, path, seed, each)) for each in ("none", kind))
         assert here["status"] == "ok" and lasting(here) == lasting(there)
-        assert set(fields) == set(others) and all((fields[name] == others[name]).all() for name in fields)
+        assert set(fields) == set(others)
+        assert all(np.array_equal(fields[name], others[name], equal_nan=True) for name in fields)
         assert here["peak_memory"] is None and 50e6 < there["peak_memory"] < 8e9
     assert sum(each["do"] == "load" for each in sent) == 1
     states = [each["random"]["state"] for each in sent if each["do"] == "begin" and each["random"]]

@@ -155,6 +155,43 @@ def test_oracle_in_a_changing_flow(vessel, method):
     assert reference["solute_flow_error"] < 0.1 < guessing["solute_flow_error"]
 
 
+def test_uncertainty_of_sections_and_flow():
+    """The standard deviation of the flow follows from the covariance of its parts, the parameters of the velocity and
+    their variances; an error names the method."""
+    world = merged(FAST, {"schedule": {"scored_steps": 3}})
+    env = Environment("eitbench/Pipe2DSkewedVelocity-v0", json.dumps({"world": world})).make()
+    theta, variances = np.array([30.0, 2.0, -1.0]), np.array([0.5, 0.1, 0.2])
+    root = np.random.default_rng(0).normal(size=(43, 43))
+    given = []
+
+    class Estimator:
+        """Concentration 20 everywhere; its covariance is given."""
+
+        def __init__(self, task):
+            pass
+
+        def update(self, voltages, currents):
+            return Estimate(np.full(1701, 20.0), velocity=theta, velocity_variance=variances)
+
+        def covariance_of(self, functionals):
+            given.append(functionals)
+            return root @ root.T
+
+    method = baseline_of(None)._replace(make=Estimator)
+    outcome = run_estimator(env, method, 3).outcome
+    rows = given[0]
+    assert len(given) == 3 and rows.shape == (43, 1701)
+    np.testing.assert_allclose(rows[:40] @ np.full(1701, 20.0), outcome.sections[0][0], rtol=1e-12)
+    parts = rows[40:].sum(axis=1) * 20.0
+    np.testing.assert_allclose(outcome.solute_flow[0], parts @ theta, rtol=1e-12)
+    variance = np.square(theta @ root[40:]).sum() + variances @ parts**2
+    np.testing.assert_allclose(outcome.solute_flow_std, variance**0.5, rtol=1e-12)
+    np.testing.assert_allclose(outcome.section_covariance[2], (root @ root.T)[:40, :40], rtol=1e-12)
+    root = root[:-1]
+    with pytest.raises(ValueError, match=r"covariance_of\(functionals\) must .*\(43, 43\)"):
+        run_estimator(env, method, 3)
+
+
 def test_modified_arrays_of_estimators_change_nothing(tmp_path):
     """Overwriting measurements, or a returned estimate, changes neither scores nor stored estimates."""
     said = "self.level[:] = 28.0 + self.calls; {}; {}; return Estimate(self.level, self.variance, self.nu, self.S)"

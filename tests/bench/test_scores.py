@@ -46,8 +46,14 @@ def outcome(**given):
     # flows (3, 6) mol/s of true (4, 3): RMS √(10/25), amount 9 of 7
     ("estimation", {"solute_flow": (np.array([3.0, 6.0]), np.array([4.0, 3.0]))},
      {"solute_flow_error": 0.4**0.5, "solute_amount_error": 2 / 7, "arrival_error": None,
-      # one section: estimates 2.75 and 4 of the mean concentration 2.5
-      "section_error": (0.25**2 + 1.5**2)**0.5 / (2 * 2.5**2)**0.5}),
+      "solute_flow_coverage_90": None, "section_error": None, "energy_score": None}),
+    # the 90 % interval has ± 1.645 standard deviations: 1.64 are inside, 1.66 are not
+    ("estimation", {"solute_flow": (np.array([3.0, 6.0]), np.array([4.64, 7.66])), "solute_flow_std": np.ones(2)},
+     {"solute_flow_coverage_90": 0.5}),
+    # sections (3, 4) mol/m³ of true (3, 2), in one of two states; without uncertainty the energy score is the RMS error
+    ("estimation", {"sections": (np.array([[3.0, 4.0], [3.0, 2.0]]), np.full((2, 2), [3.0, 2.0])),
+                    "section_covariance": np.zeros((2, 2, 2))},
+     {"section_error": 2.0 / 26**0.5, "energy_score": 0.5 * 2.0 / 2**0.5}),
     # a slug is estimated one step late, and ends in time
     ("estimation", {"solute_flow": (np.array([0.0, 0, 0, 2, 0, 0, 0]), np.array([0.0, 0, 2, 2, 0, 0, 0]))},
      {"arrival_error": WORLD.time_step, "duration_error": WORLD.time_step}),

@@ -81,8 +81,9 @@ def test_records_can_be_reproduced(played):
     for episode in mine["episodes"]:
         assert episode["status"] == "ok" and episode["seconds"] > 0 and episode["finished"] and episode["run"] == 0
         assert {"error", "contrast_error", "voltage_discrepancy", "velocity_error", "nis", "crps", "coverage_50",
-                "coverage_90", "spread_ratio", "seconds_per_step", "solute_flow_error",
-                "solute_amount_error", "section_error", "arrival_error", "duration_error"} == episode["scores"].keys()
+                "coverage_90", "spread_ratio", "seconds_per_step", "solute_flow_error", "solute_flow_coverage_90",
+                "energy_score", "solute_amount_error", "section_error", "arrival_error",
+                "duration_error"} == episode["scores"].keys()
         assert len(episode["step_errors"]) == 3
         assert episode["scores"]["error"] == pytest.approx(np.mean(episode["step_errors"]), rel=1e-12)
     assert [episode["message"] for episode in bad["episodes"]] == 2 * ["RuntimeError: no"]

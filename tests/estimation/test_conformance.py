@@ -153,7 +153,12 @@ def test_filter_is_conditioning(form, root):
         filter_.predict()
         step = filter_.update(observation)
         if t in (1, 3, T):
-            assert_state(filter_, stacked(models[:t], of_state[:t])[-1])
+            posterior = stacked(models[:t], of_state[:t])[-1]
+            assert_state(filter_, posterior)
+            slope = filter_.space.jacobian(filter_.mean, observation.matrix)
+            k = slope.shape[1]
+            covariance = filter_.covariance_of(observation.matrix)
+            assert_close(covariance, slope @ posterior.covariance[:k, :k] @ slope.T)
         if t == 3:
             blind = of_state[t - 1]._replace(noise_variance=np.full(3, 1e12), noise_root=None)
             predicted = stacked(models[:t], [*of_state[:t - 1], blind])[-1]
@@ -253,7 +258,9 @@ def test_a_window_is_its_own_smoother():
         here = slice(2 * lag, 2 * lag + by_x.shape[1])
         estimate = filter_.estimate(lag)
         assert_close(estimate.mean, LEVEL + by_x @ posterior.mean[here])
-        assert_close(estimate.variance, ((by_x @ posterior.covariance[here, here]) * by_x).sum(axis=1))
+        covariance = by_x @ posterior.covariance[here, here] @ by_x.T
+        assert_close(estimate.variance, covariance.diagonal())
+        assert_close(filter_.covariance_of(seen[0].matrix, lag), seen[0].matrix @ covariance @ seen[0].matrix.T)
 
 
 def test_derivatives_of_log_states():

@@ -61,6 +61,8 @@ def test_a_measurement_is_the_kalman_update_of_the_members_moments():
     np.testing.assert_allclose(after.mean(axis=1), mean, rtol=1e-9, atol=1e-9)
     np.testing.assert_allclose(np.cov(after), less, atol=1e-9 * np.abs(P).max())
     np.testing.assert_allclose(estimate.variance, np.cov(after).diagonal()[:n], rtol=1e-9)
+    np.testing.assert_allclose(filter_.covariance_of(seen.matrix), seen.matrix @ np.cov(after)[:n, :n] @ seen.matrix.T,
+                               rtol=1e-9)
 
 
 def test_members_are_advected_with_their_velocities():

@@ -121,9 +121,13 @@ def test_innovations_are_those_of_the_mixture():
     apart = second.matrix @ (points[0] - points[1])
     S += p[0] * p[1] * np.outer(apart, apart) + np.diag(second.noise_variance)
     filter_.update(second)
-    _, _, innovation, covariance, *_ = filter_.estimate()
+    _, variance, innovation, covariance, *_ = filter_.estimate()
     np.testing.assert_allclose(innovation, expected, rtol=1e-9)
     np.testing.assert_allclose(covariance, S, rtol=1e-9)
+    joint = filter_.covariance_of(np.eye(len(variance)))
+    np.testing.assert_allclose(joint.diagonal(), variance, rtol=1e-9)
+    np.testing.assert_allclose(filter_.covariance_of(second.matrix), second.matrix @ joint @ second.matrix.T,
+                               rtol=1e-9)
 
 
 def test_regimes_are_counted():

@@ -41,6 +41,7 @@ def test_linear_voltages_are_the_kalman_filter():
         np.testing.assert_allclose(steps[0].innovation, steps[1].innovation, atol=1e-8)
         np.testing.assert_allclose(steps[0].innovation_covariance, steps[1].innovation_covariance, rtol=1e-8)
         np.testing.assert_allclose(ours.estimate().mean, theirs.mean, rtol=0, atol=1e-8)
+        np.testing.assert_allclose(ours.covariance_of(np.eye(N)), theirs.covariance.array, rtol=0, atol=1e-9 * scale)
 
 
 def test_moments_of_a_quadratic_function():
@@ -73,4 +74,5 @@ def test_closer_to_the_true_moments_than_linearisation(std):
         step = filter_.assimilate(np.zeros(L), currents)
         errors.append((np.linalg.norm(-step.innovation - samples.mean(axis=0)),
                        np.linalg.norm(step.innovation_covariance - np.cov(samples.T) - 9.0 * np.eye(L))))
+    np.testing.assert_allclose(ours.covariance_of(np.eye(n)).diagonal(), ours.estimate().variance, rtol=1e-9)
     assert errors[0][0] < 0.3 * errors[1][0] + 0.003 and errors[0][1] < 0.7 * errors[1][1] + 0.003, errors

@@ -49,7 +49,7 @@ def test_method_and_score_make_a_record_and_a_board(installed):
     for path in records.glob("*.json"):
         record = json.loads(path.read_text())
         scores[record["method"]] = [episode["scores"] for episode in record["episodes"]]
-        assert {len(episode) for episode in scores[record["method"]]} == {16}
+        assert {len(episode) for episode in scores[record["method"]]} == {18}
     error = {name: np.mean([each["error"] for each in own]) for name, own in scores.items()}
     assert error.keys() == set(methods) and error["bubble_tracker"] < 0.8 * error["homogeneous"]
     distance = [each["bubble_distance"] for each in scores["bubble_tracker"]]

@@ -24,7 +24,7 @@ def test_a_homogeneous_fluid_leaves_at_the_volumetric_flow(name, area, tolerance
     transport = (round_pipe() if name == "round" else
                  eitbench.make_task(entry(f"eitbench/{name}-v0").world).transport)
     c = np.full(transport.mesh.n_nodes, 30.0)
-    flow = outlet_of(transport).solute_flow(c, transport.velocity)
+    flow = outlet_of(transport).flow_weights(transport.velocity) @ c
     assert flow == pytest.approx(30.0 * V * area, rel=tolerance)
 
 
@@ -38,4 +38,4 @@ def test_a_profile_across_the_pipe():
         return laminar(points) * (1.0 + points[:, 1:] / R)
 
     expected = 1.5 * V * R * (2 * 4 / 3 + 4 / 15)            # ∫(1 − η²)(1 + η)(2 + η) dη from −1 to 1
-    assert outlet_of(transport).solute_flow(2.0 + y / R, skewed) == pytest.approx(expected, rel=1e-4)
+    assert outlet_of(transport).flow_weights(skewed) @ (2.0 + y / R) == pytest.approx(expected, rel=1e-4)
