@@ -113,25 +113,24 @@ class InflowWindow(StateSpace):
         return self.c_ref * (1.0 + deviation @ weights.reshape(len(weights), -1).T @ basis.T)
 
     def variance(self, mean: np.ndarray, covariance: Covariance, lag: int = 0) -> np.ndarray:
-        basis, reduced = self._reduced_covariance(mean, covariance, lag)
-        return ((basis @ reduced) * basis).sum(axis=1)
-
-    def covariance_of(self, functionals: np.ndarray, mean: np.ndarray, covariance: Covariance,
-                      lag: int = 0) -> np.ndarray:
-        basis, reduced = self._reduced_covariance(mean, covariance, lag)
-        rows = functionals @ basis
-        return rows @ reduced @ rows.T
-
-    def _reduced_covariance(self, mean: np.ndarray, covariance: Covariance,
-                            lag: int) -> tuple[np.ndarray, np.ndarray]:
-        """Return a basis (n, q) of the state ``lag`` steps ago, and its covariance (q, q) there."""
         basis, weights = self.response(lag)
         slope = self._by_x(mean, weights, lag)
         here = slice(lag * self.n_modes, (lag + self.response_steps) * self.n_modes)
         reduced = slope @ covariance.array[here, here] @ slope.T
         if self.residual_covariance is not None:
             reduced = reduced + self.c_ref**2 * self.residual_covariance
-        return basis, reduced
+        return ((basis @ reduced) * basis).sum(axis=1)
+
+    def covariance_of(self, functionals: np.ndarray, mean: np.ndarray, covariance: Covariance,
+                      lag: int = 0) -> np.ndarray:
+        J = self.jacobian(mean, functionals, lag)
+        first = lag * self.n_modes
+        here = slice(first, first + J.shape[1])
+        found: np.ndarray = J @ covariance.array[here, here] @ J.T
+        if self.residual_covariance is not None:
+            rows = self.c_ref * (functionals @ self.response(lag).basis)
+            found += rows @ self.residual_covariance @ rows.T
+        return found
 
     def jacobian(self, mean: np.ndarray, matrix: np.ndarray, lag: int = 0) -> np.ndarray:
         basis, weights = self.response(lag)

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from eitbench.bench import runner
-from eitbench.bench.methods import Method
+from eitbench.bench.methods import Method, load_method
 from eitbench.bench.run import Job, run_episode, run_jobs
 from eitbench.bench.runner import EstimatorOutput, run_estimator
 from eitbench.bench.store import EpisodeStore
@@ -190,6 +190,30 @@ def test_uncertainty_of_sections_and_flow():
     root = root[:-1]
     with pytest.raises(ValueError, match=r"covariance_of\(functionals\) must .*\(43, 43\)"):
         run_estimator(env, method, 3)
+
+
+@pytest.mark.parametrize(("id", "method"), [
+    ("Pipe2DTurbulent", "turbulent_filter"), ("Pipe2DFixedLag", "identified_flow"), ("Pipe2D", "adaptive_inflow_filter"),
+    ("Pipe2DIntermittent", "particle_filter"), ("Pipe2DUnknownVelocity", "joint_inflow_filter")])
+def test_joint_covariances_include_the_variances(id, method):
+    """The covariance of the concentrations at some nodes is positive definite with their variances on the diagonal."""
+    short = {"schedule": {"scored_steps": 6}}
+    world = short if method == "identified_flow" else merged(FAST, short)       # its model is for the default world
+    env = Environment(f"eitbench/{id}-v0", json.dumps({"world": world})).make()
+    observation, _ = env.reset(seed=3)
+    rows = np.eye(1701)[::200]
+    player, checked, done = load_method(method, "estimation").make(env.task), 0, False
+    while not done:
+        estimate = player.update(observation["voltages"], observation["currents"])
+        observation, _, done, _, _ = env.step(env.action_space.sample())
+        if estimate is None or estimate.variance is None:
+            continue
+        covariance = player.covariance_of(rows)
+        np.testing.assert_allclose(covariance.diagonal(), estimate.variance[::200],
+                                   rtol=0.01)       # variances omit unlikely particles
+        assert np.linalg.eigvalsh(covariance)[0] > -1e-9 * covariance.max()
+        checked += 1
+    assert checked
 
 
 def test_modified_arrays_of_estimators_change_nothing(tmp_path):
