@@ -132,7 +132,9 @@ class Functionals(NamedTuple):
 def functionals_of(env: EstimationEnv) -> Functionals | None:
     """Return the functionals of an environment; None without a flow through the vessel."""
     task, model = env.task, env.task.transport
-    if not (isinstance(model, ConvectionDiffusion) and model.inlet.size):
+    truth = cached_truth_model(env.world).transport
+    if not (isinstance(model, ConvectionDiffusion) and isinstance(truth, ConvectionDiffusion)
+            and model.inlet.size):
         return None
     interpolation, mass = region_operators(env.world)
     points = truth_mesh(env.world).points
