@@ -260,7 +260,7 @@ class EstimatorOutput:
             variance = np.einsum("tk,tkl,tl->t", theta, covariances[:, q:, q:], theta)
             if task.velocity:       # the correlation of velocity and concentration is neglected
                 variance += (parts**2 * self.velocity_variances[states]).sum(axis=1)
-            fields["solute_flow_std"] = np.sqrt(variance)
+            fields["solute_flow_std"] = np.sqrt(np.maximum(variance, 0.0))
         return fields
 
 
@@ -377,16 +377,26 @@ def _iter_steps(env: EstimationEnv | MeasuredEnv, estimator: Method, seed: int,
         covariance = None
         if functionals is not None and t > env.task.warm_up and hasattr(player, "covariance_of"):
             rows = np.concatenate([functionals.sections, functionals.flows])
-            covariance = player.covariance_of(rows)
-            if covariance is not None:
-                covariance = _check.array("Estimator.covariance_of(functionals)", covariance,
-                                          (len(rows), len(rows)))
+            covariance = _checked_covariance(player.covariance_of(rows), len(rows))
         answer = silence if estimate is None else estimate
         action = answer.mean
         if (flow := env.task.velocity) is not None:
             action = np.append(action, flow.nominal if answer.velocity is None else answer.velocity)
         observation, _, done, _, _ = env.step(action)
         yield t, estimate, seen, seconds, covariance
+
+
+def _checked_covariance(covariance: Any, m: int) -> np.ndarray | None:
+    """Return the covariance (m, m) of functionals; None if the estimator has none."""
+    if covariance is None:
+        return None
+    name = "Estimator.covariance_of(functionals)"
+    checked = _check.array(name, covariance, (m, m))
+    spectrum = np.linalg.eigvalsh(0.5 * checked + 0.5 * checked.T)
+    if spectrum[0] < -1e-6 * abs(spectrum[-1]):
+        raise ValueError(f"{name} must be positive semidefinite, got eigenvalues from "
+                         f"{spectrum[0]:g} to {spectrum[-1]:g}")
+    return checked
 
 
 def _check_estimate(estimate: Any, task: Task, measured: np.ndarray) -> None:

@@ -162,7 +162,7 @@ def test_uncertainty_of_sections_and_flow():
     env = Environment("eitbench/Pipe2DSkewedVelocity-v0", json.dumps({"world": world})).make()
     theta, variances = np.array([30.0, 2.0, -1.0]), np.array([0.5, 0.1, 0.2])
     root = np.random.default_rng(0).normal(size=(43, 43))
-    given = []
+    given, sign = [], 1.0
 
     class Estimator:
         """Concentration 20 everywhere; its covariance is given."""
@@ -175,7 +175,7 @@ def test_uncertainty_of_sections_and_flow():
 
         def covariance_of(self, functionals):
             given.append(functionals)
-            return root @ root.T
+            return sign * root @ root.T
 
     method = baseline_of(None)._replace(make=Estimator)
     outcome = run_estimator(env, method, 3).outcome
@@ -189,6 +189,9 @@ def test_uncertainty_of_sections_and_flow():
     np.testing.assert_allclose(outcome.section_covariance[2], (root @ root.T)[:40, :40], rtol=1e-12)
     root = root[:-1]
     with pytest.raises(ValueError, match=r"covariance_of\(functionals\) must .*\(43, 43\)"):
+        run_estimator(env, method, 3)
+    root, sign = np.eye(43), -1.0
+    with pytest.raises(ValueError, match=r"covariance_of\(functionals\) must be positive semidefinite"):
         run_estimator(env, method, 3)
 
 
