@@ -29,7 +29,6 @@ WITHOUT_FLOW = {"back_projection": "BP", "noser": "NOSER", "total_variation": "T
                 "gauss_newton": "GN", "random_walk_filter": "walk",
                 "temporal_regularisation": "temporal"}
 """Method without a flow model -> column of its table."""
-PLANT = ("Pipe2D", "Pipe2DSmoothing")
 PLANT_SCORES = ("error", "solute_flow_error", "solute_flow_coverage_90", "solute_amount_error",
                 "section_error", "energy_score", "arrival_error", "duration_error")
 THESIS = ("kalman_filter", "fixed_lag_smoother", "fixed_interval_smoother")
@@ -159,20 +158,21 @@ def methods() -> str:
     return Table.of(rows).markdown()
 
 
-def plant() -> str:
-    """Return the table of the scores of flows and slugs in `PLANT`, by the error of the flow."""
+def plant(*ids: str) -> str:
+    """Return the table of the scores of flows and slugs in environments, by the flow's error."""
     shown = [scores()[name] for name in PLANT_SCORES]
     found = leaderboard().dropna(subset="solute_flow_error").sort_values("solute_flow_error")
     rows = [{"environment": id, "method": row["method"]} | {
                 score.heading: number_cell(score.factor * row[score.name]) for score in shown}
-            for id in PLANT for _, row in found[found["environment"] == id].iterrows()]
+            for id in ids for _, row in found[found["environment"] == id].iterrows()]
     return Table.of(rows).markdown()
 
 
 def main() -> None:
     """Write the tables between their markers."""
     for name, made in (("environments", environments()), ("estimators", estimators()),
-                       ("methods", methods()), ("pipe2d", plant())):
+                       ("methods", methods()), ("pipe2d", plant("Pipe2D", "Pipe2DSmoothing")),
+                       ("velocity", plant("Pipe2DUnknownVelocity"))):
         path = ROOT / "docs" / f"{name}.md"
         before, rest = path.read_text(encoding="utf-8").split("<!-- table -->\n")
         after = rest.partition("\n<!-- end -->")[2]
