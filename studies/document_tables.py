@@ -172,7 +172,8 @@ def main() -> None:
     """Write the tables between their markers."""
     for name, made in (("environments", environments()), ("estimators", estimators()),
                        ("methods", methods()), ("pipe2d", plant("Pipe2D", "Pipe2DSmoothing")),
-                       ("velocity", plant("Pipe2DUnknownVelocity"))):
+                       ("velocity", plant("Pipe2DUnknownVelocity")),
+                       ("turbulence", plant("Pipe2DTurbulent"))):
         path = ROOT / "docs" / f"{name}.md"
         before, rest = path.read_text(encoding="utf-8").split("<!-- table -->\n")
         after = rest.partition("\n<!-- end -->")[2]
