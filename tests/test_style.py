@@ -10,7 +10,7 @@ import pytest
 ROOT = Path(__file__).parent.parent
 PACKAGE = ROOT / "eitbench"
 BUDGETS = {"numerics": 1658, "scoring": 205, "physics": 1688, "worlds": 2761, "data": 1485, "estimation": 6696,
-           "measured": 2090, "envs": 1683, "bench": 4730, "report": 2741, "rl": 848, "cli": 1013}
+           "measured": 2090, "envs": 1683, "bench": 4732, "report": 2741, "rl": 848, "cli": 1013}
 """Package (or module) -> lines of Python allowed, blank lines and docstrings included. Each imports only from those
 before it."""
 TOP = 433

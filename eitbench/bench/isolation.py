@@ -369,6 +369,8 @@ class Worker:
 
     def covariance_of(self, functionals: np.ndarray) -> np.ndarray | None:
         """Return the estimator's covariance of linear functionals, if it has one."""
+        if not self.about.get("has_covariance"):
+            return None
         return self._ask("covariance_of", functionals=functionals)[1].get("covariance")
 
     def act(self, observation: Mapping[str, np.ndarray]) -> Any:
@@ -568,7 +570,8 @@ class _MethodServer:
         self._known = env.task if track == "estimation" else env.rules
         attributes = ("name", "title", "subtracks", "parameters", "role", "privileged")
         about = {name: getattr(self._method, name) for name in attributes}
-        return about | {"suits": self._method.suits(self._known)}
+        return about | {"suits": self._method.suits(self._known),
+                        "has_covariance": hasattr(self._method.make, "covariance_of")}
 
     def begin(self, random: dict[str, Any] | None) -> dict[str, Any]:
         """Make a new instance of the method."""
@@ -588,8 +591,8 @@ class _MethodServer:
                 if value is not None}
 
     def covariance_of(self, functionals: np.ndarray) -> dict[str, Any]:
-        """Return the estimator's covariance of linear functionals, if it has one."""
-        known = getattr(self._instance, "covariance_of", lambda functionals: None)(functionals)
+        """Return the estimator's covariance of linear functionals, if it has one now."""
+        known = self._instance.covariance_of(functionals)
         return {} if known is None else {"covariance": np.asarray(known)}
 
     def act(self, **observation: np.ndarray) -> dict[str, Any]:

@@ -111,7 +111,9 @@ def run_on_measurements(env: MeasuredEnv, method: str | Method, seed: int = 0, *
 
 def run_estimator(env: EstimationEnv, estimator: Method, seed: int) -> EpisodeRun:
     """Run an estimator on one episode."""
-    output = EstimatorOutput(env.task, _iter_steps(env, estimator, seed))
+    functionals = functionals_of(env)
+    rows = None if functionals is None else functionals.rows
+    output = EstimatorOutput(env.task, _iter_steps(env, estimator, seed, rows))
     return EpisodeRun(output.outcome(env), output.currents, output.fields())
 
 
@@ -121,11 +123,9 @@ class Functionals(NamedTuple):
 
     true_sections: np.ndarray
     """(q, n_truth) mean of each of `N_SECTIONS` equal sections, of a concentration of the truth"""
-    sections: np.ndarray
-    """(q, n) the same, of an estimate"""
-    flows: np.ndarray
-    """(k, n) m³/s (m²/s in 2D): flow of solute through the outlet, or derivatives of it by the k
-    parameters of the flow"""
+    rows: np.ndarray
+    """(q + k, n) the same of an estimate; then, in m³/s (m²/s in 2D), the flow of solute through the
+    outlet, or its derivatives by the k parameters of the flow"""
 
 
 @lru_cache(maxsize=4)
@@ -146,8 +146,8 @@ def functionals_of(env: EstimationEnv) -> Functionals | None:
     averages /= averages.sum(axis=1, keepdims=True)
     outlet = outlet_of(model)
     fields = task.velocity.basis_fields if task.velocity else [model.velocity]
-    flows = np.array([outlet.flow_weights(field) for field in fields])
-    return Functionals(averages, averages @ interpolation, flows)
+    flows = [outlet.flow_weights(field) for field in fields]
+    return Functionals(averages, np.concatenate([averages @ interpolation, flows]))
 
 
 class EstimatorOutput:
@@ -163,7 +163,7 @@ class EstimatorOutput:
         self.velocity_variances = np.zeros_like(self.velocities)
         """(T, k) m²/s²; 0 if not reported"""
         self.covariances: dict[int, np.ndarray] = {}
-        """t -> covariance (q + k, q + k) of `Functionals.sections` and `Functionals.flows`"""
+        """t -> covariance (q + k, q + k) of `Functionals.rows`"""
         self.innovations: dict[int, tuple[np.ndarray, np.ndarray]] = {}
         """i of a measurement vector -> ν (L,) in V and S (L, L) in V²"""
         self.seconds: list[float] = []
@@ -248,14 +248,14 @@ class EstimatorOutput:
         drawn = world.flow.draw(world, episode_streams(env.core.seeds[0]).flow)
         true = np.array([outlet.flow_weights(drawn(t) if drawn else velocity) @ concentration
                          for t, concentration in enumerate(truth, task.warm_up + 1)])
-        parts = means @ functionals.flows.T
+        sections, parts = np.split(means @ functionals.rows.T, [len(functionals.true_sections)], 1)
         theta = self.velocities[states] if task.velocity else np.ones_like(parts)
         fields: dict[str, Any] = {
             "solute_flow": ((parts * theta).sum(axis=1), true),
-            "sections": (means @ functionals.sections.T, truth @ functionals.true_sections.T)}
+            "sections": (sections, truth @ functionals.true_sections.T)}
         if all(t in self.covariances for t in range(task.warm_up + 1, task.n_steps + 1)):
             covariances = np.array([self.covariances[t] for t in sorted(self.covariances)])
-            q = len(functionals.sections)
+            q = sections.shape[1]
             fields["section_covariance"] = covariances[:, :q, :q]
             variance = np.einsum("tk,tkl,tl->t", theta, covariances[:, q:, q:], theta)
             if task.velocity:       # the correlation of velocity and concentration is neglected
@@ -344,8 +344,9 @@ def iter_estimates(env: EstimationEnv, estimator: Method,
 
 
 def _iter_steps(env: EstimationEnv | MeasuredEnv, estimator: Method, seed: int,
-                ) -> Iterator[Step]:
-    """Yield a `Step` for each measurement i, with t = i − lag."""
+                functionals: np.ndarray | None = None) -> Iterator[Step]:
+    """Yield a `Step` for each measurement i, with t = i − lag, and in scored states with the
+    covariance of ``functionals`` (m, n), if the estimator returns it."""
     with allow_test_seeds():
         observation, _ = env.reset(seed=seed)
     shown: list[Any] = [env.task]
@@ -357,7 +358,6 @@ def _iter_steps(env: EstimationEnv | MeasuredEnv, estimator: Method, seed: int,
     player = estimator.make(*shown)
     setup = time.perf_counter() - begin
     silence = Estimate(np.full(env.task.mesh.n_nodes, env.task.expected_concentration))
-    functionals = functionals_of(env) if isinstance(env, EstimationEnv) else None
     t = -env.task.lag
     done = False
     while not done:
@@ -376,8 +376,7 @@ def _iter_steps(env: EstimationEnv | MeasuredEnv, estimator: Method, seed: int,
                 env.core.estimate_std = np.sqrt(estimate.variance)
         covariance = None
         if functionals is not None and t > env.task.warm_up and hasattr(player, "covariance_of"):
-            rows = np.concatenate([functionals.sections, functionals.flows])
-            covariance = _checked_covariance(player.covariance_of(rows), len(rows))
+            covariance = _checked_covariance(player.covariance_of(functionals), len(functionals))
         answer = silence if estimate is None else estimate
         action = answer.mean
         if (flow := env.task.velocity) is not None:
