@@ -124,7 +124,7 @@ class Functionals(NamedTuple):
     true_sections: np.ndarray
     """(q, n_truth) mean of each of `N_SECTIONS` equal sections, of a concentration of the truth"""
     rows: np.ndarray
-    """(q + k, n) the same of an estimate; then, in m³/s (m²/s in 2D), the flow of solute through the
+    """(q + k, n) the same of an estimate; then, in m³/s (m²/s in 2D), the solute flow through the
     outlet, or its derivatives by the k parameters of the flow"""
 
 
