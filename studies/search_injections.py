@@ -4,8 +4,9 @@ The criterion is the mean reward on the first training episodes with the reduced
 used at equal intervals. First each pair is injected constantly. Then a cycle of the twelve best
 pairs grows by the best pair while the criterion improves, to four pairs at most. Then coordinate
 search replaces each pair of the cycle until convergence. In a round tank, pairs that rotate around
-it are tried too. In environments with a separate current
-for each electrode, coordinate search over -1, -1/2, 0, 1/2 and 1 starts from the best pair, from
+it are tried too. If the electrodes to measure are chosen, these pairs measure the neighbours first;
+then coordinate search places the measured electrodes relative to the source, for the three best
+rotations. In environments with a separate current for each electrode, coordinate search over -1, -1/2, 0, 1/2 and 1 starts from the best pair, from
 the first half of the electrodes against the second, and from random signs. Dev and test episodes
 are not used. The results are in `baselines/injection/best_pair.py`, `best_cycle.py` and
 `best_currents.py`.
@@ -14,7 +15,9 @@ are not used. The results are in `baselines/injection/best_pair.py`, `best_cycle
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
+from itertools import product
 from typing import Any
 
 import gymnasium as gym
@@ -30,6 +33,7 @@ from eitbench.worlds.vessels import RoundTank
 N_BEST_PAIRS = 12
 MAX_CYCLE_LENGTH = 4
 N_RANDOM_STARTS = 6
+N_ROTATIONS = 3
 CURRENT_VALUES = (-1.0, -0.5, 0.0, 0.5, 1.0)
 
 
@@ -46,7 +50,8 @@ class Search:
         self.rewards: dict[tuple[Any, ...], float] = {}
 
     def __call__(self, cycle: Sequence[Any]) -> float:
-        """Return the mean reward of a scored state for a cycle of pairs or current tuples."""
+        """Return the mean reward of a scored state for a cycle of pairs, of tuples of currents, or
+        of tuples of a pair and the electrodes to measure."""
         key = tuple(cycle)
         if key not in self.rewards:
             env = self.env
@@ -58,8 +63,9 @@ class Search:
             for _ in range(world.n_steps - len(world.currents)):
                 now = rules.is_injection_step(observation["left"][0])
                 chosen = key[injected % len(key)] if now else None
-                action = (np.array(chosen, np.float32) if isinstance(chosen, tuple)
-                          else rules.action(chosen))
+                action = (rules.action(chosen) if not isinstance(chosen, tuple)
+                          else rules.action(*chosen) if rules.chooses_readings
+                          else np.array(chosen, np.float32))
                 observation, reward, *_ = env.step(np.array([action] * env.num_envs))
                 injected += now
                 total += reward.mean()
@@ -135,14 +141,44 @@ def search_rotation(search: Search) -> None:
     """Search for the best cycle in which a pair rotates around a tank."""
     pairs = search.env.rules.pairs.tolist()
     L = search.env.world.vessel.n_electrodes
-    rotations = [[pairs.index(sorted(((k * step) % L, (k * step + span) % L))) for k in range(L)]
-                 for step in range(1, L // 2, 2) for span in range(1, L // 2 + 1)]
-    best = max(tqdm(rotations, desc="rotations", disable=None), key=search)
+
+    def cycle(step: int, span: int, places: Sequence[int] | None = None) -> list[Any]:
+        numbers = [pairs.index(sorted(((k * step) % L, (k * step + span) % L))) for k in range(L)]
+        if places is None:
+            return numbers
+        return [(number, tuple((k * step + place) % L for place in places))
+                for k, number in enumerate(numbers)]
+
+    rotations = sorted(tqdm(list(product(range(1, L // 2, 2), range(1, L // 2 + 1))),
+                            desc="rotations", disable=None),
+                       key=lambda each: -search(cycle(*each)))
+    best = cycle(*rotations[0])
+    if search.env.rules.chooses_readings:
+        best = max((cycle(*rotation, best_places(search, partial(cycle, *rotation), rotation[1]))
+                    for rotation in tqdm(rotations[:N_ROTATIONS], desc="places", disable=None)),
+                   key=search)
     report("rotation", search, search.env.rules.pairs, best)
 
 
-def report(kind: str, search: Search, pairs: np.ndarray, cycle: Sequence[int]) -> None:
-    print(f"{kind}: {pairs[list(cycle)].tolist()}, mean reward {search(cycle):.6f} in "
+def best_places(search: Search, cycle: Callable[[Sequence[int]], list[Any]],
+                span: int) -> tuple[int, ...]:
+    """Return the best electrodes to measure, relative to the source of a rotating pair; the search
+    begins with the neighbours of the pair, ``span`` electrodes apart."""
+    places = tuple(np.resize([-1, 1, span - 1, span + 1], search.env.rules.instrument.n_voltmeters))
+    before = None
+    while before != places:
+        before = places
+        for k in range(len(places)):
+            places = max(((*places[:k], place, *places[k + 1:])
+                          for place in range(search.env.world.vessel.n_electrodes)),
+                         key=lambda each: search(cycle(each)))
+    return places
+
+
+def report(kind: str, search: Search, pairs: np.ndarray, cycle: Sequence[Any]) -> None:
+    chosen = [each if isinstance(each, tuple) else (each, ()) for each in cycle]
+    electrodes = [[*map(int, (*pairs[pair], *more))] for pair, more in chosen]
+    print(f"{kind}: {electrodes}, mean reward {search(cycle):.6f} in "
           f"{len(search.seeds)} episodes, {search.steps} environment steps")
 
 

@@ -1,7 +1,8 @@
 """Best cycle: round-robin over up to four pairs, optimised on training episodes; a budget is used
 at equal intervals.
 
-For a body that stays in a tank a pair that rotates around the tank is better.
+For a body that stays in a tank a pair that rotates around the tank is better. If the electrodes to
+measure are chosen, they rotate with it.
 """
 
 from typing import Any
@@ -11,6 +12,10 @@ from eitbench.estimation.onboard.rules import Rules
 
 ROTATION = [sorted((5 * k % 16, (5 * k + 3) % 16)) for k in range(16)]
 """Three electrodes apart, and five further in each step."""
+READINGS_ROTATION = [
+    [*sorted((5 * k % 16, (5 * k + 4) % 16)), *((5 * k + place) % 16 for place in (12, 8, 9, 2))]
+    for k in range(16)]
+"""Four electrodes apart, and five further in each step; then the electrodes to measure."""
 
 
 class Policy(CyclePolicy):
@@ -21,7 +26,7 @@ class Policy(CyclePolicy):
                   "Pipe2DIntermittent with a budget": [[0, 10]],
                   "Pipe2DIntermittent with a budget and a fitted inflow prior": [[0, 9]],
                   "Pipe2DDriftingVelocity": [[7, 8], [1, 7]], "RotatingTank2D": [[9, 15]],
-                  "TankTracking": ROTATION, "SearchAndTrack": [[4, 13], [3, 14], [0, 10]],
+                  "TankTracking": ROTATION, "TankReadings": READINGS_ROTATION, "SearchAndTrack": [[4, 13], [3, 14], [0, 10]],
                   "BubbleTracking": [[2, 10], [4, 12], [2, 10]],
                   "TwoBubbleTracking": [[2, 9], [1, 12], [3, 8]]},
         "environment_steps": {
@@ -30,14 +35,14 @@ class Policy(CyclePolicy):
             "Pipe2DIntermittent with a budget": 768_768,
             "Pipe2DIntermittent with a budget and a fitted inflow prior": 768_768,
             "Pipe2DDriftingVelocity": 217_792,
-            "RotatingTank2D": 333_696, "TankTracking": 712_704, "SearchAndTrack": 712_704,
-            "BubbleTracking": 1_127_424, "TwoBubbleTracking": 546_816}}
+            "RotatingTank2D": 333_696, "TankTracking": 712_704, "TankReadings": 1_824_768,
+            "SearchAndTrack": 712_704, "BubbleTracking": 1_127_424, "TwoBubbleTracking": 546_816}}
 
     @classmethod
     def suits(cls, rules: Rules) -> bool:
         pairs = rules.pairs.tolist()
-        found = cls.parameters["cycle"].get(rules.tuning_key, [None])
-        return all(pair in pairs for pair in found)
+        found = cls.parameters["cycle"].get(rules.tuning_key, [[]])
+        return all(each[:2] in pairs for each in found)
 
     def electrodes(self) -> list[list[int]]:
         return self.parameters["cycle"][self.rules.tuning_key]

@@ -8,11 +8,11 @@ entry.
 import numpy as np
 
 from eitbench.envs.injection_core import InjectionCore
-from eitbench.estimation.onboard.policies import PairPolicy
+from eitbench.estimation.onboard.policies import BeliefPolicy
 from eitbench.estimation.onboard.rules import Rules
 
 
-class Policy(PairPolicy):
+class Policy(BeliefPolicy):
     privileged = True
     role = "reference"
 
@@ -25,4 +25,6 @@ class Policy(PairPolicy):
         self.core = core
 
     def pair(self, observation: dict[str, np.ndarray]) -> int:
-        return int(self.core.trial_errors(np.arange(len(self.rules.pairs))).argmin())
+        self.belief.criteria()                              # chooses the electrodes to measure
+        actions = [self.rules.action(k, self.readings(k)) for k in range(len(self.rules.pairs))]
+        return int(self.core.trial_errors(np.array(actions)).argmin())

@@ -261,6 +261,8 @@ def _observation_sample(observation: Any) -> dict[str, Any]:
 def _fixed_action(env: gym.Env, k: int) -> Any:
     """Return an action that depends on the step and the action space only."""
     space: Any = env.action_space
+    if isinstance(space, gym.spaces.MultiDiscrete):
+        return (7 * k + np.arange(len(space.nvec))) % space.nvec
     if isinstance(space, gym.spaces.Discrete):
         return 7 * k % int(space.n)
     if getattr(env.unwrapped, "task", None) is None:            # currents

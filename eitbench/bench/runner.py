@@ -281,13 +281,16 @@ def _run_policy(env: InjectionEnv, policy: Method, seed: int) -> EpisodeRun:
                            env.core.bodies()))
     states, errors, mean, std, innovations, estimates = zip(*scored, strict=True)
     world = env.core.world
-    distances = ospa = None
+    distances = ospa = areas = None
     if env.rules.tracks_body:
         paths = world.target.paths(world, episode_streams(seed).flow)
         centres, present = (np.stack(each, axis=1)[list(states)] for each in (
             [path.centres for path in paths], [path.present for path in paths]))
         bodies = np.concatenate(estimates)
         if present.any():
+            mean_area = np.pi * np.mean(world.target.radius_range)**2
+            areas = (mean_area * (bodies[..., -2] * bodies[..., -1]).sum(axis=1),
+                     present @ [np.pi * path.radius**2 for path in paths])
             distances = scoring.matched_distances(bodies[..., :2], centres, present)
         ospa = scoring.ospa(bodies[..., :2], bodies[..., -1] >= 0.5, centres, present,
                             LOST_DISTANCE)
@@ -298,7 +301,7 @@ def _run_policy(env: InjectionEnv, policy: Method, seed: int) -> EpisodeRun:
         n_injections=sum(bool(each.any()) for each in currents),
         mean=(interpolation @ np.array(mean).T).T, std=(interpolation @ np.array(std).T).T,
         truth=simulate(world, seed, progress=False).concentration[list(states)].astype(float),
-        mass=mass, points=truth_mesh(world).points, distances=distances, ospa=ospa,
+        mass=mass, points=truth_mesh(world).points, distances=distances, ospa=ospa, areas=areas,
         innovations=([each.value for each in used],
                      [each.covariance for each in used]) if used else None)
     return EpisodeRun(outcome, np.array(currents), {}, actions, total)

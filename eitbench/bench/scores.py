@@ -76,6 +76,8 @@ class Outcome:
     """m, between the estimated and the true position of each body in each scored state"""
     ospa: float | None = None
     """m, `scoring.ospa` of the bodies with the cutoff `LOST_DISTANCE`"""
+    areas: tuple[np.ndarray, np.ndarray] | None = None
+    """(S,) m², estimated and true total area of the bodies, if there is one in a scored state"""
     mean_nis: float | None = None
     """NIS/m of measurements"""
     ktc: float | None = None
@@ -293,6 +295,11 @@ for _score in (
           f"the states of the position error, at most {1e3 * LOST_DISTANCE:g} mm; a missed or a "
           f"false body counts as much",
           lambda outcome: outcome.ospa, tracks=("injection",), factor=1e3),
+    Score("area_error", "area error",
+          "relative RMS error of the total area of the bodies, which is the gas content of a pipe "
+          "with bubbles",
+          lambda outcome: _relative_rms(*outcome.areas), requires=("areas",),
+          tracks=("injection",)),
     Score("coverage_50", "50 %", "fraction of the truth inside the reported 50 % interval",
           lambda outcome: scoring.coverage(*_uncertainty(outcome), 0.5),
           direction="nominal", requires=("std",), tracks=TRACKS, rounding=1e-4),

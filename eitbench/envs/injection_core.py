@@ -77,7 +77,6 @@ class InjectionCore(EpisodeCore):
         self.rules = rules
         self._filters_type = filters_class(rules, estimator)
         self._is_scaled = observation == "scaled" and self._filters_type is not None
-        self._table = rules.action_currents if rules.limit is None else None
         if self._filters_type:
             self.n_initial = len(self.world.currents)
         else:
@@ -190,13 +189,14 @@ class InjectionCore(EpisodeCore):
             self._homogeneous = error / self._squares[:, k]
         return self._homogeneous
 
-    def _measure(self, k: int, currents: np.ndarray) -> np.ndarray:
-        """Return the voltages (B, L) in V of injection t = k + 1."""
+    def _measure(self, k: int, currents: np.ndarray,
+                 electrodes: np.ndarray | None = None) -> np.ndarray:
+        """Return the voltages (B, L) in V of injection t = k + 1, at chosen ``electrodes``."""
         return self.rules.instrument.measure(self.faults, k + 1, self._resistance[k], currents,
-                                             self._draws[k])
+                                             self._draws[k], electrodes)
 
     def check(self, action: Any, space: Any) -> np.ndarray:
-        if isinstance(space, spaces.Box):
+        if self.rules.limit is not None:
             return _check.array("action", action, space.shape)
         if isinstance(space, spaces.Discrete):
             return np.array(_check.integer("action", action, low=0, high=int(space.n) - 1))
@@ -204,21 +204,23 @@ class InjectionCore(EpisodeCore):
         if chosen.shape != space.shape or not np.issubdtype(chosen.dtype, np.integer):
             raise ValueError(f"actions must be integers of shape {space.shape}, "
                              f"got {chosen.dtype} of shape {chosen.shape}")
-        if chosen.min() < 0 or chosen.max() >= space.nvec[0]:
-            raise ValueError(f"actions must lie in [0, {space.nvec[0] - 1}], "
-                             f"got {chosen.min()} … {chosen.max()}")
+        # gymnasium makes a Box of integers of a batch of `MultiDiscrete`
+        highest = space.high if isinstance(space, spaces.Box) else space.nvec - 1
+        if (wrong := (chosen < 0) | (chosen > highest)).any():
+            raise ValueError(f"actions must lie in [0, {highest[wrong][0]}], got "
+                             f"{chosen[wrong][0]}")
         return chosen
 
     def act(self, actions: np.ndarray) -> np.ndarray:
-        """Inject the currents of actions (B,) or (B, L), and return the rewards (B,)."""
-        currents = self.rules.currents(actions) if self._table is None else self._table[actions]
+        """Inject the currents of actions (B, …), and return the rewards (B,)."""
+        currents = self.rules.currents(actions)
         if self.rules.budget is not None:
             currents = currents * (self.n_injections < self.rules.budget)[:, None]
             self.n_injections += currents.any(axis=1)
         self.currents = currents
         self.load_until(self.t + 1)
         self._errors = None
-        self._voltages = self._measure(self.t, currents)
+        self._voltages = self._measure(self.t, currents, self.rules.electrodes(actions))
         injected = currents.any(axis=1)
         self._waited = np.where(injected, 0, self._waited + 1)
         kept = np.ones_like(injected) if self.rules.history == "steps" else injected
@@ -250,7 +252,7 @@ class InjectionCore(EpisodeCore):
 
     def trial_errors(self, actions: np.ndarray) -> np.ndarray:
         """Return the relative errors (A,) of the first episode's estimate after each of these
-        actions (A,), measured without noise. The episode does not advance. For oracles, in
+        actions (A, …), measured without noise. The episode does not advance. For oracles, in
         environments with a body."""
         k = self.t
         self.load_until(k + 1)
@@ -258,7 +260,8 @@ class InjectionCore(EpisodeCore):
         filters: Any = self._filters
         trial = filters.repeat(len(actions))
         trial.assimilate(self.rules.instrument.measure(
-            self.faults, k + 1, self._resistance[k], currents, np.zeros_like(currents)), currents)
+            self.faults, k + 1, self._resistance[k], currents, np.zeros_like(currents),
+            self.rules.electrodes(actions)), currents)
         return trial.errors(self._moments[:, k], self._deviations[:, k], self._squares[:, k])
 
     def estimate(self) -> tuple[np.ndarray, np.ndarray]:
@@ -283,15 +286,9 @@ class InjectionCore(EpisodeCore):
         return self._filters.bodies()
 
     def action_masks(self) -> np.ndarray:
-        """Return (B, actions) bool: actions that have an effect. When the budget is used up, only
-        the last one, which does not inject, has. ``ValueError`` if actions are currents."""
-        if self._table is None:
-            raise ValueError("action_masks requires actions that are numbers of pairs, got "
-                             "actions that are currents")
-        masks = np.ones((len(self.n_injections), len(self._table)), dtype=bool)
-        if self.rules.budget is not None:
-            masks[self.n_injections >= self.rules.budget, :-1] = False
-        return masks
+        """Return (B, actions) bool as `Rules.action_masks` does."""
+        budget = np.inf if self.rules.budget is None else self.rules.budget
+        return self.rules.action_masks(self.n_injections >= budget)
 
     def observe(self) -> Observation:
         """Return raw observations (B, …): the last measurement and features of the estimate."""

@@ -44,7 +44,7 @@ class AgentPolicy:
 
     def choose(self, observation: np.ndarray, mask: np.ndarray) -> Any:
         """Return the action for a scaled observation (d,); ``mask`` (n,) bool marks the allowed
-        ones of n numbered actions (empty if actions are currents)."""
+        ones of n numbered actions, of each component in turn (empty if actions are currents)."""
         raise NotImplementedError
 
     def act(self, observation: dict[str, np.ndarray]) -> Any:
@@ -57,10 +57,11 @@ class AgentPolicy:
             self._filters.assimilate(observation["voltages"][None], observation["currents"][None])
         features = self._filters.features()
         observation = observation | {name: array[0] for name, array in features.items()}
-        n = getattr(self.rules.action_space, "n", 0)
-        is_spent = self.rules.budget is not None and observation["left"][1] == 0.0
-        return self.choose(flatten_scaled(self.rules, observation),
-                           np.arange(n) >= is_spent * (n - 1))
+        mask = np.ones(0, dtype=bool)
+        if self.rules.limit is None:
+            is_spent = self.rules.budget is not None and observation["left"][1] == 0.0
+            (mask,) = self.rules.action_masks(np.array([is_spent]))
+        return self.choose(flatten_scaled(self.rules, observation), mask)
 
 
 class _ModelPolicy(AgentPolicy):

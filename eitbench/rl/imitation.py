@@ -43,9 +43,10 @@ def imitate(model: Any, world: InjectionEnv, options: dict[str, Any], reward_sca
     random = np.random.default_rng([seed, 1])
     optimiser = torch.optim.Adam(model.policy.parameters(), lr=settings["learning_rate"])
 
-    def act(observation: np.ndarray) -> int:
+    def act(observation: np.ndarray) -> Any:
         masks = {"action_masks": world.action_masks()} if isinstance(model, MaskablePPO) else {}
-        return int(model.predict(observation, **masks)[0])
+        action = model.predict(observation, **masks)[0]
+        return action if action.ndim else int(action)
 
     labelled = []
     with tqdm(total=settings["rounds"] * settings["episodes"], unit="episode", disable=None,

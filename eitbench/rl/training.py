@@ -267,7 +267,7 @@ def make_evaluator(env: str, kwargs: dict[str, Any] | None,
 
 def _check_together(algo: str, config: TrainingConfig, world: InjectionEnv) -> None:
     """Raise ``ValueError`` if algorithm, configuration and environment do not match."""
-    numbered = isinstance(world.action_space, spaces.Discrete)
+    numbered = world.rules.limit is None
     if algo in (("sac",) if numbered else ("dqn", "maskable_ppo")):
         asks, takes = ("currents", "numbers") if numbered else ("numbers", "currents")
         raise ValueError(
@@ -285,7 +285,7 @@ def _check_together(algo: str, config: TrainingConfig, world: InjectionEnv) -> N
 def _new_model(algo: str, config: TrainingConfig, learning: VecEnv, seed: int,
                how: dict[str, Any]) -> BaseAlgorithm:
     policy: Any = "MlpPolicy"
-    if isinstance(learning.action_space, spaces.Discrete):
+    if not isinstance(learning.action_space, spaces.Box):
         policy = {"ppo": PairPolicy, "maskable_ppo": MaskablePairPolicy,
                   "recurrent_ppo": "MlpLstmPolicy"}.get(algo, policy)
     arguments = {"policy_kwargs": {"net_arch": list(config.hidden)}} | config.algorithm

@@ -11,8 +11,9 @@ from eitbench import _check
 from eitbench.physics.observation import VoltageNoise
 from eitbench.worlds.fields import ADDED_LATER, check_not_negative, check_positive, check_ranges
 
-READINGS = ("all", "neighbours")
-"""Electrodes whose voltages are measured: all, or the two next to each driven one."""
+READINGS = ("all", "neighbours", "chosen")
+"""Electrodes whose voltages are measured: all, the two next to each driven one, or those that an agent
+selects."""
 
 
 class Faults(NamedTuple):
@@ -67,7 +68,10 @@ class Instrument:
     uniformly for each episode"""
     readings: str = field(default="all", metadata=ADDED_LATER)
     """electrodes that are measured in an injection, one of `READINGS`. "neighbours": a serial
-    instrument with few voltmeters, whose other voltages are NaN; electrode L − 1 is next to 0"""
+    instrument with few voltmeters, whose other voltages are NaN; electrode L − 1 is next to 0.
+    "chosen": an agent selects them with the injection; the neighbours in the first frame"""
+    n_voltmeters: int = field(default=4, metadata=ADDED_LATER)
+    """number of electrodes that an agent selects in each injection if readings are "chosen" ones"""
 
     def __post_init__(self) -> None:
         # a voltage can be 0: without noise_relative_to_max estimators would divide by zero
@@ -77,6 +81,9 @@ class Instrument:
         if self.current_norm is not None:
             _check.choice("current_norm", self.current_norm, ("L1", "L2", "Linf"))
         _check.choice("readings", self.readings, READINGS)
+        if self.readings == "chosen" and self.current_norm is not None:
+            raise ValueError("current_norm must be None with the readings 'chosen', got "
+                             f"{self.current_norm!r}")
         _check.number("loose_noise", self.loose_noise, low=1.0)
         _check.number("contact_impedance_spread", self.contact_impedance_spread, low=0.0, high=0.95)
         check_ranges(self, open_low=False, n_dead_range="", n_failing_range="", n_loose_range="",
@@ -116,11 +123,13 @@ class Instrument:
         return Faults(broken, resistance, factor)
 
     def measure(self, faults: Faults, t: np.ndarray | int, transfer_resistance: np.ndarray,
-                currents: np.ndarray, draws: np.ndarray) -> np.ndarray:
+                currents: np.ndarray, draws: np.ndarray,
+                electrodes: np.ndarray | None = None) -> np.ndarray:
         """Return voltages (B, L) in V, 𝓡 I plus noise: B episodes at one step, or one at steps t.
 
         Arguments are `Faults` of arrays (B, L), or (L,) for all; t, or (B,); 𝓡 (B, L, L); the
-        requested currents I (B, L) in A (A/m in 2D); standard normal numbers (B, L).
+        requested currents I (B, L) in A (A/m in 2D); standard normal numbers (B, L); and
+        ``electrodes`` as for `measurement_mask`.
         """
         broken = np.asarray(t)[..., None] >= faults.open_circuit_from
         flows = ~(broken & (currents != 0.0)).any(axis=1, keepdims=True)
@@ -130,12 +139,18 @@ class Instrument:
         std = self.noise_mismatch * std
         voltages = np.where(broken, self.interference * draws, clean + std * draws)
         if self.readings != "all":
-            voltages[~self.measurement_mask(currents)] = np.nan
+            voltages[~self.measurement_mask(currents, electrodes)] = np.nan
         return voltages
 
-    def measurement_mask(self, currents: np.ndarray) -> np.ndarray:
-        """Return the mask (..., L) of the electrodes that are measured for currents (..., L)."""
+    def measurement_mask(self, currents: np.ndarray,
+                         electrodes: np.ndarray | None = None) -> np.ndarray:
+        """Return the mask (..., L) of the electrodes that are measured for currents (..., L), or of
+        the chosen ``electrodes`` (..., n_voltmeters)."""
         if self.readings == "all":
             return np.ones(currents.shape, dtype=bool)
+        if electrodes is not None:
+            chosen = np.zeros(currents.shape, dtype=bool)
+            np.put_along_axis(chosen, electrodes, True, axis=-1)
+            return chosen
         driven = currents != 0.0
         return (np.roll(driven, 1, axis=-1) | np.roll(driven, -1, axis=-1)) & ~driven

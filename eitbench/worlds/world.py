@@ -189,6 +189,9 @@ class World:
             raise ValueError("instrument: n_dead_range, n_failing_range and n_loose_range must "
                              "leave two electrodes without fault, got up to "
                              f"{self.instrument.max_faulty} of {self.vessel.n_electrodes}")
+        if self.instrument.readings == "chosen":
+            _check.integer("instrument.n_voltmeters", self.instrument.n_voltmeters, low=1,
+                           high=self.vessel.n_electrodes)
         if self.region is not None:
             self._check_region(self.region)
 

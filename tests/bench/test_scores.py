@@ -60,6 +60,8 @@ def outcome(**given):
     # distances 1, 3 and 50 mm: the median is 3 mm, and a third of the states are lost
     ("injection", {"distances": np.array([0.001, 0.05, 0.003]), "ospa": 0.02},
      {"position_error": 0.003, "lost_fraction": 1 / 3, "ospa": 0.02}),
+    # areas of 1 m² too much and too little, of 3 and 4 m²
+    ("injection", {"areas": (np.array([4.0, 3.0]), np.array([3.0, 4.0]))}, {"area_error": 2**0.5 / 5}),
 ])
 def test_numbers_by_hand(track, given, expected):
     """Scores equal their formulas; without data they are None."""
@@ -72,7 +74,7 @@ def test_policies_have_theirs():
     """Policies have error, injections, time, and scores of the filter's uncertainty if it is available."""
     said = compute_scores("injection", Outcome(WORLD, 0.5, np.array([0.1, 0.3]), n_injections=7))
     claims = dict.fromkeys(("nis", "crps", "coverage_50", "coverage_90", "spread_ratio",
-                           "position_error", "lost_fraction", "ospa"))
+                           "position_error", "lost_fraction", "ospa", "area_error"))
     assert said == claims | {"error": pytest.approx(0.2), "spent": 7.0, "seconds_per_step": 0.5}
 
 

@@ -22,11 +22,11 @@ from scipy.special import softmax
 from short import merged
 from short import world as short_world
 
-ID, SEARCH, BUBBLES, TWO = (f"eitbench/{name}-v0" for name in (
-    "TankTracking", "SearchAndTrack", "BubbleTracking", "TwoBubbleTracking"))
+ID, CHOSEN, SEARCH, BUBBLES, TWO = (f"eitbench/{name}-v0" for name in (
+    "TankTracking", "TankReadings", "SearchAndTrack", "BubbleTracking", "TwoBubbleTracking"))
 
 
-@lru_cache(maxsize=3)
+@lru_cache(maxsize=4)
 def rules_of(id=ID):
     changes = short_world(id)["world"]
     if id in (BUBBLES, TWO):
@@ -119,6 +119,54 @@ def test_criteria_are_those_of_a_gaussian_of_images_and_voltages(id):
         S = joint[m:, m:] + R
         assert gains[pair] == pytest.approx(np.trace(joint[:m, m:] @ np.linalg.solve(S, joint[m:, :m])), rel=1e-6)
         assert information[pair] == pytest.approx(0.5 * np.linalg.slogdet(S @ np.linalg.inv(R))[1], rel=1e-6)
+
+
+@pytest.mark.parametrize("count", [1, 3])
+def test_chosen_electrodes_are_the_most_informative_ones(count):
+    """Each one maximises the A-criterion together with those before it, among all electrodes of the pair."""
+    rules = Rules(rules_of(CHOSEN).world.with_changes({"instrument": {"n_voltmeters": count}}))
+    core = InjectionCore(rules, "reduced")
+    core.reset([3])
+    belief = BodyBelief(rules, {name: array[0] for name, array in core.observe().items()})
+    criteria = belief.criteria()
+    every = np.tile(np.arange(16), (120, 1))
+
+    def gains(electrodes):
+        """Return the criteria with these electrodes (120, k) as the only ones that exist."""
+        other = BodyBelief(Rules(rules.world.with_changes({"instrument": {"n_voltmeters": electrodes.shape[1]}})),
+                           {name: array[0] for name, array in core.observe().items()})
+        other._entries = tuple(np.take_along_axis(each, electrodes, axis=1) for each in other._entries)
+        other._variance = np.take_along_axis(other._variance, electrodes, axis=1)
+        return other.criteria()
+
+    assert belief.electrodes.shape == (120, count)
+    for k in range(count):
+        before = belief.electrodes[:, :k]
+        table = np.array([gains(np.hstack([before, every[:, [r]]]))[0] for r in range(16)])
+        table[before.T, np.arange(120)] = 0.0
+        np.testing.assert_allclose(np.take_along_axis(table, belief.electrodes[:, [k]].T, axis=0)[0], table.max(axis=0),
+                                   rtol=1e-9)
+    np.testing.assert_allclose(criteria, gains(belief.electrodes), rtol=1e-9)
+
+
+def test_neighbours_can_be_chosen():
+    """Voltages, estimates and rewards are those of an instrument that measures the neighbours; a policy with the same
+    observations has the same particles."""
+    (fixed, _), (chosen, belief) = believed(ID), believed(CHOSEN)
+    for pair in (57, 3, 119):
+        action = chosen.rules.action(pair)
+        np.testing.assert_array_equal(chosen.act(action[None]), fixed.act(np.array([pair])))
+        np.testing.assert_array_equal(chosen._voltages, fixed._voltages)
+        belief.update({name: array[0] for name, array in chosen.observe().items()})
+        np.testing.assert_array_equal(belief._filters.filter.weights, chosen._filters.filter.weights)
+
+
+def test_only_chosen_electrodes_are_measured():
+    """Also driven ones, and an electrode that is named twice once; beside them an observation has zeros."""
+    core, _ = believed(CHOSEN)
+    core.act(np.array([[0, 1, 7, 7, 12]]))
+    assert np.flatnonzero(core.observe()["voltages"][0]).tolist() == [1, 7, 12]
+    assert core.innovations()[0].value.shape == (3,)
 
 
 def test_bodies_have_the_same_order_in_all_particles():

@@ -261,13 +261,16 @@ def test_the_command_prints_the_score_and_the_next_command(monkeypatch, tmp_path
 
 
 @pytest.mark.parametrize(("algorithm", "policy"), [("ppo", PairPolicy), ("maskable_ppo", MaskablePairPolicy)])
-def test_an_agent_chooses_the_most_probable_pair(algorithm, policy):
-    """`predict` returns the same action, for random observations and masks."""
-    model = ALGORITHMS[algorithm](policy, gym.make(NAME, **SHORT), seed=4)
-    rng = np.random.default_rng(0)
+@pytest.mark.parametrize("id", [NAME, "eitbench/TankReadings-v0"])
+def test_an_agent_chooses_the_most_probable_pair(algorithm, policy, id):
+    """`predict` returns the same action, for random observations and masks, also of the electrodes to measure."""
+    env = gym.make(id, **world(id))
+    model = ALGORITHMS[algorithm](policy, env, seed=4)
+    rng = np.random.default_rng(1)
     actions = []
     for observation in rng.normal(size=(50, *model.observation_space.shape)).astype(np.float32):
-        masks = {"action_masks": rng.uniform(size=120) < 0.5} if algorithm == "maskable_ppo" else {}
+        masks = ({"action_masks": rng.uniform(size=env.unwrapped.rules.action_masks(np.zeros(1, bool)).size) < 0.5}
+                 if algorithm == "maskable_ppo" else {})
         actions.append(most_probable(model.policy, observation, **masks))
-        assert actions[-1] == model.predict(observation, deterministic=True, **masks)[0]
-    assert len(set(actions)) > 5
+        np.testing.assert_array_equal(actions[-1], model.predict(observation, deterministic=True, **masks)[0])
+    assert len({tuple(np.atleast_1d(action)) for action in actions}) > 5

@@ -55,19 +55,51 @@ def pair_design_criteria(
     noise_variance : (p, m)
         Noise of the voltages, per current squared; infinite for rejected measurements.
     """
+    signal, weighted = _whitened(entries, noise_variance, voltage_covariance,
+                                 weighted_voltage_covariance)
+    S = signal + np.eye(signal.shape[1])
+    gains = (np.linalg.inv(S) * weighted).sum(axis=(1, 2))
+    return gains, 0.5 * np.linalg.slogdet(S)[1]
+
+
+def best_electrodes(voltage_covariance: np.ndarray, weighted_voltage_covariance: np.ndarray,
+                    entries: tuple[np.ndarray, np.ndarray], noise_variance: np.ndarray,
+                    count: int) -> np.ndarray:
+    """Return the places (p, count) of voltages of each pair among its m: first the one with the
+    largest A-criterion, then the one that increases it most, and so on. Arguments as in
+    `pair_design_criteria`."""
+    S, W = _whitened(entries, noise_variance, voltage_covariance, weighted_voltage_covariance)
+    pairs = np.arange(len(S))
+    free = np.ones(S.shape[:2], dtype=bool)
+    chosen = np.empty((len(S), count), dtype=int)
+    for k in range(count):
+        variance = np.diagonal(S, axis1=1, axis2=2) + 1.0
+        gains = np.where(free, np.diagonal(W, axis1=1, axis2=2) / variance, -1.0)
+        best = chosen[:, k] = gains.argmax(axis=1)
+        free[pairs, best] = False
+        # condition on this voltage: S − s sᵀ/σ², and likewise the rows and columns of W
+        row, weighted = S[pairs, best], W[pairs, best]
+        share = row / variance[pairs, best, None]
+        W = (W - share[:, :, None] * weighted[:, None] - weighted[:, :, None] * share[:, None]
+             + weighted[pairs, best, None, None] * share[:, :, None] * share[:, None])
+        S = S - share[:, :, None] * row[:, None]
+    return chosen
+
+
+def _whitened(entries: tuple[np.ndarray, np.ndarray], noise_variance: np.ndarray,
+              *tables: np.ndarray) -> list[np.ndarray]:
+    """Return the products (p, m, m) of each pair's voltages relative to their noise, from tables
+    (N, N) as in `pair_design_criteria`."""
     i, j = entries
     root = 1.0 / np.sqrt(noise_variance)              # zero for rejected measurements
     scale = root[:, :, None] * root[:, None, :]
-    flat = [one[:, :, None] * len(voltage_covariance) + other[:, None, :]
+    flat = [one[:, :, None] * len(tables[0]) + other[:, None, :]
             for one, other in ((i, i), (i, j), (j, j))]
-
-    def whiten(table: np.ndarray) -> np.ndarray:
+    whitened = []
+    for table in tables:
         entering, mixed, leaving = (table.take(each) for each in flat)
-        return scale * (entering + leaving - mixed - mixed.swapaxes(1, 2))
-
-    S = whiten(voltage_covariance) + np.eye(root.shape[1])
-    gains = (np.linalg.inv(S) * whiten(weighted_voltage_covariance)).sum(axis=(1, 2))
-    return gains, 0.5 * np.linalg.slogdet(S)[1]
+        whitened.append(scale * (entering + leaving - mixed - mixed.swapaxes(1, 2)))
+    return whitened
 
 
 class Belief:
@@ -354,10 +386,15 @@ class BodyBelief:
         self._functionals = np.vstack([signals, self._filters.patches.toarray()]).T.copy()
         """(G, N + patches) entries of 𝓡 and patches, of a body at each grid point"""
         currents = rules.action_currents[:len(rules.pairs)]
-        electrodes, measured = measured_first(rules.instrument.measurement_mask(currents))
-        std = np.take_along_axis(model.noise_std(currents @ model.resistance), electrodes, axis=1)
+        mask = (np.ones(currents.shape, dtype=bool) if rules.chooses_readings
+                else rules.instrument.measurement_mask(currents))
+        self.electrodes, measured = measured_first(mask)
+        """(pairs, m) electrodes that are measured with each pair; if they are chosen, from
+        `criteria` on the best ones, the most informative one first"""
+        std = np.take_along_axis(model.noise_std(currents @ model.resistance), self.electrodes,
+                                 axis=1)
         self._variance = np.where(measured, std**2, np.inf)
-        self._entries = number[rules.pairs.T[:, :, None], electrodes]
+        self._entries = number[rules.pairs.T[:, :, None], self.electrodes]
 
     def update(self, observation: dict[str, np.ndarray]) -> None:
         """Assimilate the outcome of the last injection."""
@@ -368,7 +405,8 @@ class BodyBelief:
 
         They treat particles and voltages as jointly Gaussian: the decrease of the expected squared
         error of the image on the coarse grid, and half of the decrease of the log-determinant of
-        the voltages' covariance.
+        the voltages' covariance. If electrodes are chosen, each pair has the ones that decrease the
+        error most, one after the other.
         """
         i, j = self._entries
         filters = self._filters.filter
@@ -387,4 +425,10 @@ class BodyBelief:
         square = variance[i] + variance[j] - 2.0 * covariance[i, j] + (mean[i] - mean[j])**2
         noise = self._variance + filters.model.motion.signal_error**2 * square
         cross = covariance[:, -self._filters.patches.shape[0]:]
-        return pair_design_criteria(covariance, cross @ cross.T, self._entries, noise)
+        tables = covariance, cross @ cross.T
+        if not self.rules.chooses_readings:
+            return pair_design_criteria(*tables, self._entries, noise)
+        self.electrodes = best_electrodes(*tables, self._entries, noise,
+                                          self.rules.instrument.n_voltmeters)
+        i, j, noise = (np.take_along_axis(each, self.electrodes, axis=1) for each in (i, j, noise))
+        return pair_design_criteria(*tables, (i, j), noise)

@@ -28,7 +28,7 @@ class BodyFilters(EpisodeFilters):
 
     def _condition(self, voltages: np.ndarray,
                    currents: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        measured = self._rules.instrument.measurement_mask(currents)
+        measured = np.nan_to_num(voltages) != 0.0           # observations have 0 for others
         innovations = self.filter.assimilate(voltages, currents, measured)
         return innovations, np.ones(measured.shape, dtype=bool)
 

@@ -138,8 +138,8 @@ def state_space(world: World, inflow: str) -> StateSpace:
 
 def filters_class(rules: Rules, estimator: str) -> type[EpisodeFilters] | None:
     """Return the filters' class for one of `ESTIMATOR_OPTIONS`, None for "none". ``ValueError`` for
-    another option, or if the rules have a learned inflow or estimated faults that the world does
-    not permit."""
+    another option, or if the rules have a learned inflow, estimated faults or few readings that the
+    world does not permit."""
     _check.choice("estimator", estimator, ESTIMATOR_OPTIONS)
     if estimator == "none":
         return None
@@ -153,6 +153,9 @@ def filters_class(rules: Rules, estimator: str) -> type[EpisodeFilters] | None:
         if rules.world.velocity_model is not None:
             raise ValueError("inflow must be 'white' where the velocity is estimated too, "
                              f"got {rules.inflow!r}")
+    if rules.instrument.readings != "all" and not rules.tracks_body:
+        raise ValueError("readings must be 'all' in an injection environment without a moving "
+                         f"body, got {rules.instrument.readings!r}")
     if rules.tracks_body:
         return BodyFilters if estimator == "reduced" else FullBodyFilters
     return ReducedFilters if estimator == "reduced" else FullFilters

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from itertools import cycle
 from typing import Any
 
@@ -21,7 +21,10 @@ class PairPolicy:
 
     def act(self, observation: dict[str, np.ndarray]) -> Any:
         """Return the action for a raw observation."""
-        return self.rules.action(self.pair(observation) if self.injects(observation) else None)
+        if not self.injects(observation):
+            return self.rules.action(None)
+        pair = self.pair(observation)
+        return self.rules.action(pair, self.readings(pair))
 
     def injects(self, observation: dict[str, np.ndarray]) -> bool:
         """Return whether to inject at this step."""
@@ -31,6 +34,10 @@ class PairPolicy:
         """Return the number of the next pair."""
         raise NotImplementedError
 
+    def readings(self, pair: int) -> Sequence[int] | None:
+        """Return the electrodes to measure, if they are chosen; None: the neighbours."""
+        return None
+
 
 class CyclePolicy(PairPolicy):
     """Policy that injects through given pairs in turn."""
@@ -38,14 +45,20 @@ class CyclePolicy(PairPolicy):
     def __init__(self, rules: Rules, random: np.random.Generator) -> None:
         super().__init__(rules, random)
         numbers = {frozenset(pair): k for k, pair in enumerate(rules.pairs.tolist())}
-        self._cycle = cycle([numbers[frozenset(pair)] for pair in self.electrodes()])
+        self._cycle = cycle([(numbers[frozenset(each[:2])], each[2:] or None)
+                             for each in self.electrodes()])
+        self._readings: Sequence[int] | None = None
 
-    def electrodes(self) -> Iterable[Iterable[int]]:
-        """Return the two electrodes of each pair of the cycle."""
+    def electrodes(self) -> Iterable[Sequence[int]]:
+        """Return the two electrodes of each pair of the cycle, and optionally those to measure."""
         raise NotImplementedError
 
     def pair(self, observation: dict[str, np.ndarray]) -> int:
-        return next(self._cycle)
+        pair, self._readings = next(self._cycle)
+        return pair
+
+    def readings(self, pair: int) -> Sequence[int] | None:
+        return self._readings
 
 
 class BeliefPolicy(PairPolicy):
@@ -61,3 +74,6 @@ class BeliefPolicy(PairPolicy):
         else:
             self.belief.update(observation)
         return super().act(observation)
+
+    def readings(self, pair: int) -> Sequence[int] | None:
+        return self.belief.electrodes[pair] if self.rules.chooses_readings else None

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -35,7 +37,8 @@ class Rules:
     world : World
         Its instrument's ``current_norm`` selects the actions: numbers of electrode pairs (None), or
         L currents relative to the instrument's amplitude. These are clipped to ±1, the bounds of
-        the action space, centred, and scaled down to the norm of a pair if they exceed it. Its
+        the action space, centred, and scaled down to the norm of a pair if they exceed it. With its
+        readings "chosen", an action is the number of a pair and of each electrode to measure. Its
         schedule's ``budget`` limits the injections of an episode; the agent may then also inject
         nothing.
     gate : float
@@ -81,6 +84,11 @@ class Rules:
         return self.world.schedule.budget
 
     @property
+    def chooses_readings(self) -> bool:
+        """True if an action selects the electrodes to measure too."""
+        return self.world.instrument.readings == "chosen"
+
+    @property
     def tracks_body(self) -> bool:
         """True if the filter inside estimates positions of bodies, not a concentration."""
         return isinstance(self.world.target, MovingBody)
@@ -95,7 +103,7 @@ class Rules:
         """Current of a pair in A (A/m in 2D)."""
         return float(np.abs(self.world.currents).max())
 
-    @property
+    @cached_property
     def action_currents(self) -> np.ndarray:
         """(actions, L) currents of each numbered action; with a budget, the last row is zero."""
         pairs = pair_currents(self.world)
@@ -104,10 +112,27 @@ class Rules:
         return np.concatenate([pairs, np.zeros((1, pairs.shape[1]))])
 
     @property
-    def action_space(self) -> spaces.Discrete | spaces.Box:
-        if self.limit is None:
-            return spaces.Discrete(len(self.pairs) + (self.budget is not None))
-        return spaces.Box(-1.0, 1.0, self.world.currents.shape[1:], np.float32)
+    def action_space(self) -> spaces.Discrete | spaces.MultiDiscrete | spaces.Box:
+        L = self.world.currents.shape[1]
+        if self.limit is not None:
+            return spaces.Box(-1.0, 1.0, (L,), np.float32)
+        n = len(self.pairs) + (self.budget is not None)
+        if self.chooses_readings:
+            return spaces.MultiDiscrete([n] + self.instrument.n_voltmeters * [L])
+        return spaces.Discrete(n)
+
+    def action_masks(self, is_spent: np.ndarray) -> np.ndarray:
+        """Return (B, actions) bool: actions that have an effect, with a column for each value of
+        each component; of the injections only the last one, none, where the budget ``is_spent``
+        (B,). ``ValueError`` if actions are currents."""
+        space = self.action_space
+        if isinstance(space, spaces.Box):
+            raise ValueError("action_masks requires actions that are numbers of pairs, got "
+                             "actions that are currents")
+        sizes = [space.n] if isinstance(space, spaces.Discrete) else space.nvec
+        masks = np.ones((len(is_spent), int(sum(sizes))), dtype=bool)
+        masks[is_spent, :sizes[0] - 1] = False
+        return masks
 
     @property
     def tuning_key(self) -> str:
@@ -119,9 +144,10 @@ class Rules:
         inflow = " and a fitted inflow prior" * (budget != "" and self.inflow == "learned")
         return self.world.name + faults + budget + inflow
 
-    def action(self, pair: int | None) -> Any:
+    def action(self, pair: int | None, electrodes: Iterable[int] | None = None) -> Any:
         """Return the action that injects through the pair of this number, or nothing (None, which
-        requires a budget or current actions)."""
+        requires a budget or current actions), and if it selects the electrodes to measure, measures
+        these (n_voltmeters,), by default the neighbours of the driven ones."""
         if self.limit is not None:
             currents = np.zeros(self.world.currents.shape[1], dtype=np.float32)
             if pair is not None:
@@ -129,7 +155,18 @@ class Rules:
             return currents
         if pair is None and self.budget is None:
             raise ValueError("pair must be a number in a world without a budget, got None")
-        return len(self.pairs) if pair is None else int(pair)
+        number = len(self.pairs) if pair is None else int(pair)
+        if not self.chooses_readings:
+            return number
+        if electrodes is None:
+            mask = self.instrument.measurement_mask(self.action_currents[number])
+            electrodes = np.resize(np.flatnonzero(mask), self.instrument.n_voltmeters).tolist()
+        return np.array([number, *electrodes])
+
+    def electrodes(self, actions: np.ndarray) -> np.ndarray | None:
+        """Return the electrodes (B, n_voltmeters) to measure of a batch of actions; None unless they
+        are chosen."""
+        return actions[:, 1:] if self.chooses_readings else None
 
     def is_injection_step(self, left: np.ndarray) -> bool:
         """Return whether a uniformly distributed budget has an injection at this step, at the end
@@ -141,10 +178,10 @@ class Rules:
         return (k + 1) * self.budget // steps > k * self.budget // steps
 
     def currents(self, actions: np.ndarray) -> np.ndarray:
-        """Return currents (B, L) in A (A/m in 2D) of actions (B,), or (B, L), which are clipped to
-        ±1."""
+        """Return currents (B, L) in A (A/m in 2D) of a batch of actions; actions (B, L) that are
+        currents are clipped to ±1."""
         if self.limit is None:
-            return self.action_currents[actions]
+            return self.action_currents[actions[:, 0] if self.chooses_readings else actions]
         free = np.clip(np.asarray(actions, dtype=float), -1.0, 1.0)
         free = free - free.mean(axis=1, keepdims=True)
         order = {"L1": 1, "L2": 2, "Linf": np.inf}[self.limit]
