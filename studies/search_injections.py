@@ -6,10 +6,10 @@ pairs grows by the best pair while the criterion improves, to four pairs at most
 search replaces each pair of the cycle until convergence. In a round tank, pairs that rotate around
 it are tried too. If the electrodes to measure are chosen, these pairs measure the neighbours first;
 then coordinate search places the measured electrodes relative to the source, for the three best
-rotations. In environments with a separate current for each electrode, coordinate search over -1, -1/2, 0, 1/2 and 1 starts from the best pair, from
-the first half of the electrodes against the second, and from random signs. Dev and test episodes
-are not used. The results are in `baselines/injection/best_pair.py`, `best_cycle.py` and
-`best_currents.py`.
+rotations. In environments with a separate current for each electrode, coordinate search over -1,
+-1/2, 0, 1/2 and 1 starts from the best pair, from the first half of the electrodes against the
+second, and from random signs. Dev and test episodes are not used. The results are in
+`baselines/injection/best_pair.py`, `best_cycle.py` and `best_currents.py`.
 """
 
 from __future__ import annotations

@@ -26,7 +26,8 @@ class Policy(CyclePolicy):
                   "Pipe2DIntermittent with a budget": [[0, 10]],
                   "Pipe2DIntermittent with a budget and a fitted inflow prior": [[0, 9]],
                   "Pipe2DDriftingVelocity": [[7, 8], [1, 7]], "RotatingTank2D": [[9, 15]],
-                  "TankTracking": ROTATION, "TankReadings": READINGS_ROTATION, "SearchAndTrack": [[4, 13], [3, 14], [0, 10]],
+                  "TankTracking": ROTATION, "TankReadings": READINGS_ROTATION,
+                  "SearchAndTrack": [[4, 13], [3, 14], [0, 10]],
                   "BubbleTracking": [[2, 10], [4, 12], [2, 10]],
                   "TwoBubbleTracking": [[2, 9], [1, 12], [3, 8]]},
         "environment_steps": {

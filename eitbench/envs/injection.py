@@ -20,7 +20,8 @@ class InjectionEnv(EpisodeEnv):
 
     `Discrete(n)`: the number of an electrode pair (0, 1), (0, 2), … (`Rules.pairs`); the
     current enters at the first electrode and leaves at the second. With a budget, the last action
-    omits the injection. With `instrument.current_norm`, `Box`: a current for each electrode,
+    omits the injection. With `instrument.readings="chosen"`, `MultiDiscrete`: the pair's number and
+    the electrodes to measure. With `instrument.current_norm`, `Box`: a current for each electrode,
     relative to the instrument's current, see `Rules`.
 
     ## Observation Space

@@ -164,8 +164,8 @@ class Rules:
         return np.array([number, *electrodes])
 
     def electrodes(self, actions: np.ndarray) -> np.ndarray | None:
-        """Return the electrodes (B, n_voltmeters) to measure of a batch of actions; None unless they
-        are chosen."""
+        """Return the electrodes (B, n_voltmeters) to measure of a batch of actions; None unless
+        they are chosen."""
         return actions[:, 1:] if self.chooses_readings else None
 
     def is_injection_step(self, left: np.ndarray) -> bool:
