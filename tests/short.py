@@ -49,7 +49,6 @@ SHORT = {
     "PipeInjection": {"schedule": {"scored_steps": 4}},
     "TankTracking": {"schedule": {"scored_steps": 4}},
     "WanderingBody2D": TANK,
-    "TankReadings": {"schedule": {"scored_steps": 4}},
     "SearchAndTrack": {"schedule": {"scored_steps": 4}},
     "BubbleTracking": {"schedule": {"scored_steps": 4}},
     "TwoBubbleTracking": {"schedule": {"scored_steps": 4}},

@@ -26,7 +26,7 @@ class Policy(CyclePolicy):
                   "Pipe2DIntermittent with a budget": [[0, 10]],
                   "Pipe2DIntermittent with a budget and a fitted inflow prior": [[0, 9]],
                   "Pipe2DDriftingVelocity": [[7, 8], [1, 7]], "RotatingTank2D": [[9, 15]],
-                  "TankTracking": ROTATION, "TankReadings": READINGS_ROTATION,
+                  "TankTracking": ROTATION, "TankTracking with chosen readings": READINGS_ROTATION,
                   "SearchAndTrack": [[4, 13], [3, 14], [0, 10]],
                   "BubbleTracking": [[2, 10], [4, 12], [2, 10]],
                   "TwoBubbleTracking": [[2, 9], [1, 12], [3, 8]]},
@@ -36,7 +36,8 @@ class Policy(CyclePolicy):
             "Pipe2DIntermittent with a budget": 768_768,
             "Pipe2DIntermittent with a budget and a fitted inflow prior": 768_768,
             "Pipe2DDriftingVelocity": 217_792,
-            "RotatingTank2D": 333_696, "TankTracking": 712_704, "TankReadings": 1_824_768,
+            "RotatingTank2D": 333_696, "TankTracking": 712_704,
+            "TankTracking with chosen readings": 1_824_768,
             "SearchAndTrack": 712_704, "BubbleTracking": 1_127_424, "TwoBubbleTracking": 546_816}}
 
     @classmethod

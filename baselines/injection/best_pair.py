@@ -15,7 +15,8 @@ class Policy(CyclePolicy):
                  "Pipe2DIntermittent with a budget": [0, 10],
                  "Pipe2DIntermittent with a budget and a fitted inflow prior": [0, 9],
                  "Pipe2DDriftingVelocity": [7, 9],
-                 "RotatingTank2D": [9, 15], "TankTracking": [8, 14], "TankReadings": [8, 14],
+                 "RotatingTank2D": [9, 15], "TankTracking": [8, 14],
+                 "TankTracking with chosen readings": [8, 14],
                  "SearchAndTrack": [2, 12], "BubbleTracking": [2, 10],
                  "TwoBubbleTracking": [2, 9]},
         "environment_steps": {
@@ -24,7 +25,8 @@ class Policy(CyclePolicy):
             "Pipe2DIntermittent with a budget": 698_880,
             "Pipe2DIntermittent with a budget and a fitted inflow prior": 698_880,
             "Pipe2DDriftingVelocity": 157_440,
-            "RotatingTank2D": 303_360, "TankTracking": 368_640, "TankReadings": 368_640,
+            "RotatingTank2D": 303_360, "TankTracking": 368_640,
+            "TankTracking with chosen readings": 368_640,
             "SearchAndTrack": 368_640, "BubbleTracking": 368_640, "TwoBubbleTracking": 368_640}}
 
     @classmethod

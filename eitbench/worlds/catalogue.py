@@ -208,8 +208,9 @@ add_example(replace(TANK_TRACKING, name="WanderingBody2D",
 add_injection(TANK_TRACKING, test_seeds="test:0-49", is_starting_point=True)
 add_injection(replace(TANK_TRACKING, name="SearchAndTrack", target=WanderingBody(visit_time=1.0)),
               test_seeds="test:0-49")
-add_injection(replace(TANK_TRACKING, name="TankReadings", instrument=replace(
-    TANK_TRACKING.instrument, readings="chosen")), test_seeds="test:0-49")
+add_injection(replace(TANK_TRACKING, instrument=replace(TANK_TRACKING.instrument,
+                                                        readings="chosen")),
+              "TankReadings", test_seeds="test:0-49")
 
 # -- Bubbles in a vertical pipe --
 

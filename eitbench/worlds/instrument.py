@@ -12,8 +12,8 @@ from eitbench.physics.observation import VoltageNoise
 from eitbench.worlds.fields import ADDED_LATER, check_not_negative, check_positive, check_ranges
 
 READINGS = ("all", "neighbours", "chosen")
-"""Electrodes whose voltages are measured: all, the two next to each driven one, or those that an
-agent selects."""
+"""Electrodes whose voltages are measured: all, the two next to each driven one, or a selection of
+the agent."""
 
 
 class Faults(NamedTuple):

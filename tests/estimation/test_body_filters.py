@@ -150,7 +150,7 @@ def test_chosen_electrodes_are_the_most_informative_ones(count):
 
 
 def test_neighbours_can_be_chosen():
-    """Voltages, estimates and rewards are those of an instrument that measures the neighbours; a policy with the same
+    """Voltages and rewards equal the ones with an instrument that measures the neighbours; a policy with the same
     observations has the same particles."""
     (fixed, _), (chosen, belief) = believed(ID), believed(CHOSEN)
     for pair in (57, 3, 119):
@@ -162,7 +162,7 @@ def test_neighbours_can_be_chosen():
 
 
 def test_only_chosen_electrodes_are_measured():
-    """Also driven ones, and an electrode that is named twice once; beside them an observation has zeros."""
+    """A driven electrode may be measured; observations have zeros for all others."""
     core, _ = believed(CHOSEN)
     core.act(np.array([[0, 1, 7, 7, 12]]))
     assert np.flatnonzero(core.observe()["voltages"][0]).tolist() == [1, 7, 12]

@@ -65,8 +65,8 @@ def pair_design_criteria(
 def best_electrodes(voltage_covariance: np.ndarray, weighted_voltage_covariance: np.ndarray,
                     entries: tuple[np.ndarray, np.ndarray], noise_variance: np.ndarray,
                     count: int) -> np.ndarray:
-    """Return the places (p, count) of voltages of each pair among its m: first the one with the
-    largest A-criterion, then the one that increases it most, and so on. Arguments as in
+    """Return the places (p, count) of voltages of each pair among its m: the first has the
+    largest A-criterion, and each further one increases the criterion most. Arguments as in
     `pair_design_criteria`."""
     S, W = _whitened(entries, noise_variance, voltage_covariance, weighted_voltage_covariance)
     pairs = np.arange(len(S))
@@ -405,8 +405,8 @@ class BodyBelief:
 
         They treat particles and voltages as jointly Gaussian: the decrease of the expected squared
         error of the image on the coarse grid, and half of the decrease of the log-determinant of
-        the voltages' covariance. If electrodes are chosen, each pair has the ones that decrease the
-        error most, one after the other.
+        the voltages' covariance. If electrodes are chosen, `best_electrodes` selects them for each
+        pair.
         """
         i, j = self._entries
         filters = self._filters.filter

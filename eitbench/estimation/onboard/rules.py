@@ -136,13 +136,14 @@ class Rules:
 
     @property
     def tuning_key(self) -> str:
-        """Key of tuned values: the world's name, with suffixes for faults, a budget, and a fitted
-        inflow prior with a budget."""
+        """Key of tuned values: the world's name, with suffixes for faults, chosen readings, a
+        budget, and a fitted inflow prior with a budget."""
         estimated = "estimated " * (self.faults == "estimated")
         faults = f" with {estimated}faults" * (self.instrument.max_faulty > 0)
         budget = " with a budget" * (self.budget is not None)
         inflow = " and a fitted inflow prior" * (budget != "" and self.inflow == "learned")
-        return self.world.name + faults + budget + inflow
+        readings = " with chosen readings" * self.chooses_readings
+        return self.world.name + faults + readings + budget + inflow
 
     def action(self, pair: int | None, electrodes: Iterable[int] | None = None) -> Any:
         """Return the action that injects through the pair of this number, or nothing (None, which
