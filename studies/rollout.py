@@ -64,12 +64,10 @@ class Rollout(BeliefPolicy):
 
     def _greedy(self, filters: BodyParticleFilter, b: int) -> int:
         """Return the pair of `greedy_a` in the b-th episode of the filters."""
-        belief, one = copy(self.belief), copy(filters)
+        belief = copy(self.belief)
         belief._filters = copy(self.belief._filters)
-        one.particles = Particles(*(each[b:b + 1] for each in filters.particles))
-        one.weights = filters.weights[b:b + 1]
-        belief._filters.filter = one
-        return int(belief.criteria()[0].argmax())
+        belief._filters.filter = filters
+        return int(belief.criteria(b)[0].argmax())
 
 
 def simulated_voltages(model: BodyModel, bodies: Particles, currents: np.ndarray,

@@ -32,6 +32,7 @@ KEY_DESCRIPTIONS = {
     "velocity": "estimated mean velocity, m/s",
     "velocity_std": "standard deviation of the velocity, m/s",
     "body": f"estimate of each body, given that it is present: {'; '.join(BODY)}",
+    "gains": "A-criterion of each pair relative to the largest one",
     "waited": "steps since the last injection",
     "left": "remaining steps and, with a budget, remaining injections",
 }

@@ -59,6 +59,7 @@ class InjectionEnv(EpisodeEnv):
     | `inflow` | set by the id | inflow prior: "white" noise (Table 5.1), or "learned" |
     | `faults` | set by the id | electrode faults: the "gate" rejects measurements, or "estimated" |
     | `history` | set by the id | entries of the last "steps", or of the last "injections" |
+    | `gains` | False | with moving bodies: observations include the A-criterion of each pair |
     | `variant` | None | name of a robustness variant of the id |
     | `world` | None | numbers to change, as in `{"schedule": {"budget": 20}}` |
     | `episodes` | None | episodes of unseeded resets; None: 1, 8, … up to 1000, of dev 32 |
@@ -72,11 +73,11 @@ class InjectionEnv(EpisodeEnv):
     def __init__(self, name: str, *, variant: str | None = None,
                  world: dict[str, Any] | None = None, estimator: str = "reduced",
                  observation: str = "scaled", gate: float | None = None, inflow: str | None = None,
-                 faults: str | None = None, history: str | None = None,
+                 faults: str | None = None, history: str | None = None, gains: bool = False,
                  episodes: int | None = None, split: str = "train",
                  render_mode: str | None = None) -> None:
         core = make_core(name, variant, world, estimator, observation, gate, inflow, faults,
-                         history)
+                         history, gains)
         super().__init__(core, episodes, split, render_mode)
         self.rules = core.rules
 
@@ -119,7 +120,7 @@ class InjectionVectorEnv(EpisodeVectorEnv):
 def make_core(name: str, variant: str | None = None, world: dict[str, Any] | None = None,
               estimator: str = "reduced", observation: str = "scaled", gate: float | None = None,
               inflow: str | None = None, faults: str | None = None,
-              history: str | None = None) -> InjectionCore:
+              history: str | None = None, gains: bool = False) -> InjectionCore:
     """Return the core of an id with these arguments; ``ValueError`` names an argument that is not
     allowed."""
     registered = entry(name, variant)
@@ -127,5 +128,5 @@ def make_core(name: str, variant: str | None = None, world: dict[str, Any] | Non
     settings = dict(registered.settings) | {key: value for key, value in given.items()
                                             if value is not None}
     rules = Rules(registered.world.with_changes(world), has_first_frame=estimator != "none",
-                  **settings)
+                  gains=gains, **settings)
     return InjectionCore(rules, estimator, observation)

@@ -31,8 +31,8 @@ def flatten_scaled(rules: Rules, observation: Observation) -> np.ndarray:
     In this order: voltages, recent currents, innovations, mean and std on the grid, fault scores,
     remaining steps and, with a budget, injections, and if observations are of the last injections,
     the steps since the last one, relative to the mean interval of the budget, and if the velocity
-    is estimated, its mean and standard deviation, and if bodies are tracked, their estimates; the
-    first frame is omitted.
+    is estimated, its mean and standard deviation, and if bodies are tracked, their estimates, and
+    optionally the gains of all pairs; the first frame is omitted.
     """
     world = rules.world
     level = world.expected_concentration
@@ -53,6 +53,8 @@ def flatten_scaled(rules: Rules, observation: Observation) -> np.ndarray:
         spread = world.target.radius_range[1]
         scale = *centre, speed, speed, spread, spread, 1.0, 1.0, 1.0
         parts.append(observation["body"] / np.tile(scale, world.target.n_bodies))
+    if rules.gains:
+        parts.append(observation["gains"])
     batch = observation["voltages"].shape[:-1]
     flat = np.concatenate([part.reshape(*batch, -1) for part in parts], axis=-1)
     return np.clip(flat, -MAX_SCALED, MAX_SCALED).astype(np.float32)
@@ -122,6 +124,8 @@ class InjectionCore(EpisodeCore):
                           "velocity_std": _box(fastest, flow.n_parameters, low=0.0)}
             if rules.tracks_body:
                 shown["body"] = _box(1e3, world.target.n_bodies * len(BODY))
+            if rules.gains:
+                shown["gains"] = _box(1.0, len(rules.pairs), low=0.0)
         left = [world.n_steps] if rules.budget is None else [world.n_steps, rules.budget]
         shown["left"] = spaces.Box(np.zeros(len(left)), np.array(left, dtype=float),
                                    dtype=np.float64)

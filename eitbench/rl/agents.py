@@ -6,6 +6,7 @@ import hashlib
 import io
 import json
 import re
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -36,9 +37,11 @@ class AgentPolicy:
 
     estimator: ClassVar[str] = "reduced"
     """Filter of the environment in which the agent was trained: "reduced" or "full"."""
+    gains: ClassVar[bool] = False
+    """True if its observations had the gains of all pairs."""
 
     def __init__(self, rules: Rules, random: np.random.Generator) -> None:
-        self.rules = rules
+        self.rules = replace(rules, gains=self.gains)
         self.random = random
         self._filters: Any = None
 
@@ -73,7 +76,9 @@ class _ModelPolicy(AgentPolicy):
     @classmethod
     def suits(cls, rules: Rules) -> bool:
         """Return whether spaces have the shapes with which the model was trained."""
-        core = InjectionCore(rules, cls.estimator, "scaled")
+        if cls.gains and not rules.tracks_body:
+            return False
+        core = InjectionCore(replace(rules, gains=cls.gains), cls.estimator, "scaled")
         return bool(cls.model.action_space == core.action_space
                     and cls.model.observation_space.shape == core.observation_space.shape)
 
@@ -135,11 +140,13 @@ def save_agent(model: Any, env: Any, folder: str | Path) -> Path:
                 or any(vector.env_is_wrapped(gym.wrappers.NormalizeObservation))):
             raise ValueError("model must be trained with scaled observations, got normalised ones")
     kwargs = {name: value for name, value in spec.kwargs.items()
-              if name in ("variant", "world", "gate", "inflow", "faults", "history", "estimator")}
+              if name in ("variant", "world", "gate", "inflow", "faults", "history", "gains",
+                          "estimator")}
     core: Any = gym.make(spec.id, disable_env_checker=True, **kwargs).unwrapped
     for name in ("observation_space", "action_space"):
         expected, got = getattr(core, name), getattr(model, name)
-        if (expected.shape, getattr(expected, "n", 0)) != (got.shape, getattr(got, "n", 0)):
+        is_box = isinstance(expected, gym.spaces.Box)
+        if expected.shape != got.shape if is_box else expected != got:
             raise ValueError(f"model must have the {name} of {spec.id} with scaled observations, "
                              f"{expected}, got {got}")
     folder = Path(folder)
@@ -180,7 +187,8 @@ def load_agent(path: Path, content: bytes) -> tuple[str, str, type[AgentPolicy],
         raise ValueError(f"policy {path} must be a model of the algorithm {algo}") from error
     policy = type("Policy", (_ModelPolicy,), {
         "model": model, "uses_action_masks": algo.startswith("maskable"),
-        "estimator": asked.get("kwargs", {}).get("estimator", "reduced")})
+        "estimator": asked.get("kwargs", {}).get("estimator", "reduced"),
+        "gains": asked.get("kwargs", {}).get("gains", False)})
     built_in = (baseline_folder() / "checkpoints" / asked["env"].replace("/", "-") / algo
                 / f"seed{seed}" / "sha256")             # a copy of it is built-in too
     is_built_in = built_in.is_file() and built_in.read_text().split()[:1] == [found]

@@ -40,6 +40,7 @@ from injection_envs import BUDGET, FAULTS, FLOW, INFLOW, NAME, TANK
      "must leave two electrodes without fault, got up to 18 of 16"),
     (FAULTS, {"world": {"instrument": {"n_loose_range": "01"}}}, "n_loose_range must be an array of numbers, got str"),
     (BUDGET, {"world": {"schedule": {"budget": -1}}}, "budget must be"),
+    (NAME, {"gains": True}, "gains must be False in a world without a moving body, got True"),
     *((NAME, {"world": {"instrument": {"readings": few}}}, "readings must be 'all' in an injection environment")
       for few in ("neighbours", "chosen")),
     *((id, {"faults": "estimated"}, "faults must be 'gate' for an instrument without faults")

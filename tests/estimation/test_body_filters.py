@@ -1,6 +1,7 @@
 """The particle filter of a body: signals against the complete electrode model, weights against Bayes' formula, design
 criteria against a Gaussian of images and voltages."""
 
+from dataclasses import replace
 from functools import lru_cache
 from itertools import cycle
 
@@ -147,6 +148,20 @@ def test_chosen_electrodes_are_the_most_informative_ones(count):
         np.testing.assert_allclose(np.take_along_axis(table, belief.electrodes[:, [k]].T, axis=0)[0], table.max(axis=0),
                                    rtol=1e-9)
     np.testing.assert_allclose(criteria, gains(belief.electrodes), rtol=1e-9)
+
+
+@pytest.mark.parametrize("id", [ID, CHOSEN])
+def test_observations_may_have_the_gains_of_all_pairs(id):
+    """In each episode of a batch, they are the A-criteria of a policy with the same observations."""
+    core = InjectionCore(replace(rules_of(id), gains=True), "reduced")
+    core.reset([3, 4])
+    beliefs = [BodyBelief(core.rules, {name: array[b] for name, array in core.observe().items()}) for b in range(2)]
+    core.act(np.array([core.rules.action(57), core.rules.action(3)]))
+    shown = core.observe()
+    for b, belief in enumerate(beliefs):
+        belief.update({name: array[b] for name, array in shown.items()})
+        expected = belief.criteria()[0]
+        np.testing.assert_allclose(shown["gains"][b], expected / expected.max(), rtol=1e-12)
 
 
 def test_neighbours_can_be_chosen():

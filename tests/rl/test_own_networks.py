@@ -64,10 +64,11 @@ def assert_submits(method, tmp_path):
     return record
 
 
-def rollout(method, **kwargs):
-    """Actions of a method in an episode, and the scaled observations of the same environment."""
-    raw = gym.make(NAME, observation="raw", **SHORT, **kwargs)
-    scaled = gym.make(NAME, **SHORT, **kwargs)
+def rollout(method, id=NAME, trained=None, **kwargs):
+    """Actions of a method in an episode, and the scaled observations of the same environment, with the arguments
+    ``trained``."""
+    raw = gym.make(id, observation="raw", **world(id), **kwargs)
+    scaled = gym.make(id, **world(id), **kwargs, **(trained or {}))
     observation, _ = raw.reset(seed=3)
     seen = [scaled.reset(seed=3)[0]]
     policy, actions, ended = method.make(raw.unwrapped.rules, np.random.default_rng(0)), [], False
@@ -89,6 +90,19 @@ def test_a_model_of_stable_baselines3_is_an_agent(estimator, tmp_path):
     actions, seen = rollout(method, estimator=estimator)
     assert [int(each) for each in actions] == [int(model.predict(each, deterministic=True)[0]) for each in seen]
     assert assert_submits(path, tmp_path)["method"] == method.name
+
+
+def test_an_agent_may_see_the_gains_of_all_pairs(tmp_path):
+    """It sees them also in an environment without them; its actions name a pair and electrodes."""
+    id = "eitbench/TankReadings-v0"
+    env = gym.make(id, gains=True, **world(id))
+    model = PPO("MlpPolicy", env, seed=4, n_steps=8, batch_size=8).learn(8)
+    method = load_method(str(save_agent(model, env, tmp_path / "agent")), "injection")
+    actions, seen = rollout(method, id, {"gains": True})
+    assert seen[0].shape == (gym.make(id, **world(id)).observation_space.shape[0] + 120,)
+    np.testing.assert_array_equal(actions, [model.predict(each, deterministic=True)[0] for each in seen])
+    with pytest.raises(ValueError, match="model must have the action_space of eitbench/TankTracking-v0"):
+        save_agent(model, gym.make("eitbench/TankTracking-v0", gains=True, **world(id)), tmp_path / "other")
 
 
 def test_names_of_saved_agents(tmp_path):

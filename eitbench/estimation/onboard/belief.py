@@ -9,7 +9,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from eitbench.data.episode_cache import scoring_constants
-from eitbench.estimation.body_particles import measured_first
+from eitbench.estimation.body_particles import Particles, measured_first
 from eitbench.estimation.onboard.body_filters import BodyFilters
 from eitbench.estimation.onboard.electrode_faults import REJECTED_WEIGHT
 from eitbench.estimation.onboard.linearisation import Linearisation, linearisation_table
@@ -374,12 +374,14 @@ class Belief:
 class BodyBelief:
     """Particles of the environment's filter, and the design criteria of each injection.
 
-    It is created from the first raw observation of an episode and updated with every later one.
+    It is created from the first raw observation of an episode and updated with every later one; or
+    from the ``filters`` of several episodes.
     """
 
-    def __init__(self, rules: Rules, observation: dict[str, np.ndarray]) -> None:
+    def __init__(self, rules: Rules, observation: dict[str, np.ndarray],
+                 filters: BodyFilters | None = None) -> None:
         self.rules = rules
-        self._filters = BodyFilters(rules, observation["frame"][None])
+        self._filters = filters or BodyFilters(rules, observation["frame"][None])
         model = self._filters.filter.model
         entries, number = symmetric_entries(len(model.resistance))
         signals = rules.amplitude * model.signals[entries]
@@ -400,7 +402,7 @@ class BodyBelief:
         """Assimilate the outcome of the last injection."""
         self._filters.assimilate(observation["voltages"][None], observation["currents"][None])
 
-    def criteria(self) -> tuple[np.ndarray, np.ndarray]:
+    def criteria(self, episode: int = 0) -> tuple[np.ndarray, np.ndarray]:
         """Return the A- and D-criterion of each pair, (pairs,) each, of the next injection.
 
         They treat particles and voltages as jointly Gaussian: the decrease of the expected squared
@@ -410,9 +412,11 @@ class BodyBelief:
         """
         i, j = self._entries
         filters = self._filters.filter
+        here = slice(episode, episode + 1)
         # the random numbers of the filter's next step are not known
-        particles, (weights,) = filters.model.move(filters.particles, filters.weights,
-                                                   np.random.default_rng(1))
+        particles, (weights,) = filters.model.move(
+            Particles(*(each[here] for each in filters.particles)), filters.weights[here],
+            np.random.default_rng(1))
         index, shares = filters.model.cells(particles)
         cells = sp.csr_array((shares.ravel(), index.ravel(),
                               np.arange(0, index.size + 1, index.shape[2])),

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from copy import copy
-from functools import lru_cache
+from functools import cached_property, lru_cache
+from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
@@ -38,6 +39,20 @@ class BodyFilters(EpisodeFilters):
         copies.filter = self.filter.repeat(count)
         copies._doubt = np.repeat(self._doubt[:1], count, axis=0)
         return copies
+
+    def features(self) -> dict[str, np.ndarray]:
+        """Return the features of `EpisodeFilters`, and if the rules include ``gains``, the
+        A-criterion (B, pairs) of each pair relative to the largest one."""
+        shown = super().features()
+        if self._rules.gains:
+            gains = np.array([self._belief.criteria(b)[0] for b in range(len(self.c_ref))])
+            shown["gains"] = gains / np.maximum(gains.max(axis=1, keepdims=True), 1e-300)
+        return shown
+
+    @cached_property
+    def _belief(self) -> Any:
+        from eitbench.estimation.onboard.belief import BodyBelief  # it imports this module
+        return BodyBelief(self._rules, {}, self)
 
     def innovations(self) -> list[Innovation | None]:
         return [Innovation.of(*each) for each in zip(*self.filter.innovation, strict=True)]

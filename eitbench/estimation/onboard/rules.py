@@ -52,6 +52,8 @@ class Rules:
         Treatment of electrode faults by the estimator; see `FAULT_MODELS`.
     history : "steps" or "injections"
         Contents of observations; see `HISTORIES`.
+    gains : bool
+        True if observations have the A-criterion of each pair (worlds with moving bodies).
     """
 
     world: World
@@ -60,6 +62,7 @@ class Rules:
     inflow: str = "white"
     faults: str = "gate"
     history: str = "steps"
+    gains: bool = False
 
     def __post_init__(self) -> None:
         if self.gate != np.inf:
@@ -67,6 +70,9 @@ class Rules:
         _check.choice("inflow", self.inflow, INFLOW_MODELS)
         _check.choice("faults", self.faults, FAULT_MODELS)
         _check.choice("history", self.history, HISTORIES)
+        if self.gains and not self.tracks_body:
+            raise ValueError("gains must be False in a world without a moving body, got "
+                             f"{self.gains!r}")
 
     @property
     def instrument(self) -> Instrument:
