@@ -152,7 +152,7 @@ def test_chosen_electrodes_are_the_most_informative_ones(count):
 
 @pytest.mark.parametrize("id", [ID, CHOSEN])
 def test_observations_may_have_the_gains_of_all_pairs(id):
-    """In each episode of a batch, they are the A-criteria of a policy with the same observations."""
+    """They are the A-criteria of a policy with the same observations, for each episode of a batch."""
     core = InjectionCore(replace(rules_of(id), gains=True), "reduced")
     core.reset([3, 4])
     beliefs = [BodyBelief(core.rules, {name: array[b] for name, array in core.observe().items()}) for b in range(2)]

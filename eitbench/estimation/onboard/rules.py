@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -151,10 +150,11 @@ class Rules:
         readings = " with chosen readings" * self.chooses_readings
         return self.world.name + faults + readings + budget + inflow
 
-    def action(self, pair: int | None, electrodes: Iterable[int] | None = None) -> Any:
+    def action(self, pair: int | None, electrodes: Any = None) -> Any:
         """Return the action that injects through the pair of this number, or nothing (None, which
         requires a budget or current actions), and if it selects the electrodes to measure, measures
-        these (n_voltmeters,), by default the neighbours of the driven ones."""
+        these, by default the neighbours of the driven ones; the first ones if there are too many.
+        """
         if self.limit is not None:
             currents = np.zeros(self.world.currents.shape[1], dtype=np.float32)
             if pair is not None:
@@ -167,8 +167,8 @@ class Rules:
             return number
         if electrodes is None:
             mask = self.instrument.measurement_mask(self.action_currents[number])
-            electrodes = np.resize(np.flatnonzero(mask), self.instrument.n_voltmeters).tolist()
-        return np.array([number, *electrodes])
+            electrodes = np.flatnonzero(mask)
+        return np.array([number, *np.resize(electrodes, self.instrument.n_voltmeters)])
 
     def electrodes(self, actions: np.ndarray) -> np.ndarray | None:
         """Return the electrodes (B, n_voltmeters) to measure of a batch of actions; None unless
