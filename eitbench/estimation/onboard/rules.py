@@ -116,26 +116,30 @@ class Rules:
             return pairs
         return np.concatenate([pairs, np.zeros((1, pairs.shape[1]))])
 
+    @cached_property
+    def action_sizes(self) -> list[int]:
+        """Number of values of each component of an action; empty if actions are currents."""
+        if self.limit is not None:
+            return []
+        readings = self.instrument.n_voltmeters * self.chooses_readings
+        return [len(self.action_currents)] + readings * [self.world.currents.shape[1]]
+
     @property
     def action_space(self) -> spaces.Discrete | spaces.MultiDiscrete | spaces.Box:
-        L = self.world.currents.shape[1]
         if self.limit is not None:
-            return spaces.Box(-1.0, 1.0, (L,), np.float32)
-        n = len(self.pairs) + (self.budget is not None)
-        if self.chooses_readings:
-            return spaces.MultiDiscrete([n] + self.instrument.n_voltmeters * [L])
-        return spaces.Discrete(n)
+            return spaces.Box(-1.0, 1.0, self.world.currents.shape[1:], np.float32)
+        sizes = self.action_sizes
+        return spaces.MultiDiscrete(sizes) if len(sizes) > 1 else spaces.Discrete(sizes[0])
 
     def action_masks(self, is_spent: np.ndarray) -> np.ndarray:
         """Return (B, actions) bool: actions that have an effect, with a column for each value of
         each component; of the injections only the last one, none, where the budget ``is_spent``
         (B,). ``ValueError`` if actions are currents."""
-        space = self.action_space
-        if isinstance(space, spaces.Box):
+        sizes = self.action_sizes
+        if not sizes:
             raise ValueError("action_masks requires actions that are numbers of pairs, got "
                              "actions that are currents")
-        sizes = [space.n] if isinstance(space, spaces.Discrete) else space.nvec
-        masks = np.ones((len(is_spent), int(sum(sizes))), dtype=bool)
+        masks = np.ones((len(is_spent), sum(sizes)), dtype=bool)
         masks[is_spent, :sizes[0] - 1] = False
         return masks
 
