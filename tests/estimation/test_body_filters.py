@@ -12,7 +12,7 @@ from eitbench.data.episode_cache import cached_episode, cycle_voltages
 from eitbench.data.episodes import cached_truth_model
 from eitbench.envs.injection_core import InjectionCore
 from eitbench.estimation.body_particles import BodyParticleFilter, BodyTracker, body_model
-from eitbench.estimation.onboard.belief import BodyBelief
+from eitbench.estimation.onboard.body_filters import BodyBelief
 from eitbench.estimation.onboard.rules import Rules
 from eitbench.worlds import entry
 from eitbench.worlds.bodies import TRANSITION_WIDTH, disc_indicator

@@ -6,11 +6,8 @@ from __future__ import annotations
 from functools import cached_property
 
 import numpy as np
-import scipy.sparse as sp
 
 from eitbench.data.episode_cache import scoring_constants
-from eitbench.estimation.body_particles import Particles, measured_first
-from eitbench.estimation.onboard.body_filters import BodyFilters
 from eitbench.estimation.onboard.electrode_faults import REJECTED_WEIGHT
 from eitbench.estimation.onboard.linearisation import Linearisation, linearisation_table
 from eitbench.estimation.onboard.reduced_filters import ReducedFilters
@@ -369,70 +366,3 @@ class Belief:
     def _driven(self) -> np.ndarray:
         """(pairs, L) mask of the driven electrodes of each pair."""
         return self.rules.action_currents[:len(self.rules.pairs)] != 0.0
-
-
-class BodyBelief:
-    """Particles of the environment's filter, and the design criteria of each injection.
-
-    It is created from the first raw observation of an episode and updated with every later one; or
-    from the ``filters`` of several episodes.
-    """
-
-    def __init__(self, rules: Rules, observation: dict[str, np.ndarray],
-                 filters: BodyFilters | None = None) -> None:
-        self.rules = rules
-        self._filters = filters or BodyFilters(rules, observation["frame"][None])
-        model = self._filters.filter.model
-        entries, number = symmetric_entries(len(model.resistance))
-        signals = rules.amplitude * model.signals[entries]
-        self._functionals = np.vstack([signals, self._filters.patches.toarray()]).T.copy()
-        """(G, N + patches) entries of 𝓡 and patches, of a body at each grid point"""
-        currents = rules.action_currents[:len(rules.pairs)]
-        mask = (np.ones(currents.shape, dtype=bool) if rules.chooses_readings
-                else rules.instrument.measurement_mask(currents))
-        self.electrodes, measured = measured_first(mask)
-        """(pairs, m) electrodes that are measured with each pair; if they are chosen, from
-        `criteria` on the best ones, the most informative one first"""
-        std = np.take_along_axis(model.noise_std(currents @ model.resistance), self.electrodes,
-                                 axis=1)
-        self._variance = np.where(measured, std**2, np.inf)
-        self._entries = number[rules.pairs.T[:, :, None], self.electrodes]
-
-    def update(self, observation: dict[str, np.ndarray]) -> None:
-        """Assimilate the outcome of the last injection."""
-        self._filters.assimilate(observation["voltages"][None], observation["currents"][None])
-
-    def criteria(self, episode: int = 0) -> tuple[np.ndarray, np.ndarray]:
-        """Return the A- and D-criterion of each pair, (pairs,) each, of the next injection.
-
-        They treat particles and voltages as jointly Gaussian: the decrease of the expected squared
-        error of the image on the coarse grid, and half of the decrease of the log-determinant of
-        the voltages' covariance. If electrodes are chosen, `best_electrodes` selects them for each
-        pair.
-        """
-        i, j = self._entries
-        filters = self._filters.filter
-        here = slice(episode, episode + 1)
-        # the random numbers of the filter's next step are not known
-        particles, (weights,) = filters.model.move(
-            Particles(*(each[here] for each in filters.particles)), filters.weights[here],
-            np.random.default_rng(1))
-        index, shares = filters.model.cells(particles)
-        cells = sp.csr_array((shares.ravel(), index.ravel(),
-                              np.arange(0, index.size + 1, index.shape[2])),
-                             shape=(len(weights), len(self._functionals)))
-        functionals = cells @ self._functionals
-        mean = weights @ functionals
-        deviation = functionals - mean
-        covariance = deviation.T @ (weights[:, None] * deviation)
-        variance = np.diagonal(covariance)
-        square = variance[i] + variance[j] - 2.0 * covariance[i, j] + (mean[i] - mean[j])**2
-        noise = self._variance + filters.model.motion.signal_error**2 * square
-        cross = covariance[:, -self._filters.patches.shape[0]:]
-        tables = covariance, cross @ cross.T
-        if not self.rules.chooses_readings:
-            return pair_design_criteria(*tables, self._entries, noise)
-        self.electrodes = best_electrodes(*tables, self._entries, noise,
-                                          self.rules.instrument.n_voltmeters)
-        i, j, noise = (np.take_along_axis(each, self.electrodes, axis=1) for each in (i, j, noise))
-        return pair_design_criteria(*tables, (i, j), noise)

@@ -8,7 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from eitbench.estimation.onboard.belief import Belief, BodyBelief
+from eitbench.estimation.onboard.belief import Belief
+from eitbench.estimation.onboard.body_filters import BodyBelief
 from eitbench.estimation.onboard.rules import Rules
 
 
