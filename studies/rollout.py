@@ -1,4 +1,4 @@
-"""Rollouts of injection policies for bodies: `python studies/rollout.py ID`, half an hour.
+"""Rollouts of injection policies for bodies: `python studies/rollout.py ID`, 15 minutes.
 
 For each of the pairs with the largest A-criterion, a rollout simulates the next voltages of bodies
 that are drawn from the particles, and continues with `greedy_a` (rollout policy improvement:
@@ -26,6 +26,7 @@ from eitbench.data.seeds import parse_seeds
 from eitbench.estimation.body_particles import BodyModel, BodyParticleFilter, Particles
 from eitbench.estimation.onboard.policies import BeliefPolicy
 from eitbench.worlds import entries
+from eitbench.worlds.bodies import MovingBody
 
 CANDIDATES = 6
 BODIES = 8
@@ -86,7 +87,9 @@ def simulated_voltages(model: BodyModel, bodies: Particles, currents: np.ndarray
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition(":")[0])
     parser.add_argument("env", choices=[id for id, each in entries().items()
-                                        if each.track == "injection"])
+                                        if each.track == "injection"
+                                        and isinstance(each.world.target, MovingBody)
+                                        and each.world.instrument.readings == "neighbours"])
     parser.add_argument("--seeds", default="dev:0-15")
     given = parser.parse_args()
     env: Any = gym.make(given.env, observation="raw")

@@ -25,6 +25,7 @@ class Policy(BeliefPolicy):
         self.core = core
 
     def pair(self, observation: dict[str, np.ndarray]) -> int:
-        self.belief.criteria()                              # chooses the electrodes to measure
+        if self.rules.chooses_readings:
+            self.belief.criteria()                          # finds the electrodes to measure
         actions = [self.rules.action(k, self.readings(k)) for k in range(len(self.rules.pairs))]
         return int(self.core.trial_errors(np.array(actions)).argmin())
