@@ -2,8 +2,10 @@
 
 It evaluates every pair with the true voltages without noise, for the next step only. It indicates
 the error that a policy could attain with its own measurements: it cannot measure a body before its
-entry.
+entry. Without a body it evaluates the pairs with the reduced filter.
 """
+
+from typing import Any
 
 import numpy as np
 
@@ -18,14 +20,25 @@ class Policy(BeliefPolicy):
 
     @classmethod
     def suits(cls, rules: Rules) -> bool:
-        return rules.tracks_body
+        return rules.budget is None
 
     def __init__(self, rules: Rules, random: np.random.Generator, core: InjectionCore) -> None:
         super().__init__(rules, random)
         self.core = core
+        self.twin = None
+        """the same episode with the reduced filter"""
+        if not rules.tracks_body:
+            self.twin = InjectionCore(rules, "reduced")
+            self.twin.reset(core.seeds)
+
+    def act(self, observation: dict[str, np.ndarray]) -> Any:
+        action = super().act(observation)
+        if self.twin:
+            self.twin.act(np.array([action]))
+        return action
 
     def pair(self, observation: dict[str, np.ndarray]) -> int:
         if self.rules.chooses_readings:
             self.belief.criteria()                          # finds the electrodes to measure
         actions = [self.rules.action(k, self.readings(k)) for k in range(len(self.rules.pairs))]
-        return int(self.core.trial_errors(np.array(actions)).argmin())
+        return int((self.twin or self.core).trial_errors(np.array(actions)).argmin())

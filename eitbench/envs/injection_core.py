@@ -256,8 +256,8 @@ class InjectionCore(EpisodeCore):
 
     def trial_errors(self, actions: np.ndarray) -> np.ndarray:
         """Return the relative errors (A,) of the first episode's estimate after each of these
-        actions (A, …), measured without noise. The episode does not advance. For oracles, in
-        environments with a body."""
+        actions (A, …), measured without noise. The episode does not advance. For oracles, with
+        the reduced filter or a filter of bodies."""
         k = self.t
         self.load_until(k + 1)
         currents = self.rules.currents(actions)

@@ -185,6 +185,12 @@ class ReducedFilter:
         self.covariance = np.repeat(covariance[None], episodes, axis=0)
         self.innovation_covariance = np.empty((episodes, 0, 0))
 
+    def repeat(self, count: int) -> ReducedFilter:
+        """Return filters of ``count`` copies of the first episode."""
+        copies = ReducedFilter(self.states, count)
+        copies.mean[:], copies.covariance[:] = self.mean[0], self.covariance[0]
+        return copies
+
     def predict(self) -> None:
         """Advance one time step."""
         self.mean, self.covariance = self.states.propagate(self.mean, self.covariance)

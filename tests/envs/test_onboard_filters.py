@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from eitbench.bench.methods import load_method
 from eitbench.estimation import (
     CalibrationFrame,
     Filter,
@@ -15,7 +16,7 @@ from eitbench.estimation.onboard.belief import Belief
 from eitbench.estimation.onboard.full_filters import VELOCITY_BOUNDS
 from eitbench.estimation.onboard.inflow_states import fit_world_prior
 
-from injection_envs import FLOW, INFLOW, NAME, filter_of, make, some_pairs
+from injection_envs import FAULTS, FLOW, INFLOW, NAME, filter_of, make, some_pairs
 
 
 def of_a_baseline(name, env) -> Filter:
@@ -93,3 +94,35 @@ def test_design_criteria_are_decreases_of_the_expected_error(name):
         single = 2e-5 if name == NAME else 1e-3                                             # the filter's precision
         np.testing.assert_allclose(after, inside, atol=single * np.abs(inside).max())
         belief.update(observation)
+
+
+@pytest.mark.parametrize("name", [FAULTS, "eitbench/Pipe2DInjectionInflowFaults-v0", FLOW, "eitbench/TankTracking-v0",
+                                  "eitbench/SearchAndTrack-v0"])
+def test_trial_errors_are_those_of_actions_without_noise(name):
+    """Trials change nothing; all states of the filter are copied, so the errors are equal to rounding."""
+    core = make("reduced", name).unwrapped.core
+    core.reset([3])
+    for pair in some_pairs():
+        core.act(pair[None])
+        if core.t >= core.world.warm_up:
+            break
+    trials = core.trial_errors(np.array([7, 100]))
+    np.testing.assert_array_equal(core.trial_errors(np.array([7, 100])), trials)
+    core.load_until(core.t + 1)
+    core._draws[core.t] = 0.0
+    core.act(np.array([100]))
+    assert core.errors()[0] == pytest.approx(trials[1], rel=1e-9)
+    assert trials[0] != pytest.approx(trials[1], rel=1e-4)
+
+
+def test_one_step_oracle_injects_the_best_pair_of_the_reduced_filter():
+    """With the full filter inside too: it plays the same episode with the reduced one."""
+    env, twin = make("full", FAULTS).unwrapped, make("reduced", FAULTS).unwrapped.core
+    observation, _ = env.reset(seed=3)
+    twin.reset([3])
+    policy = load_method("one_step_oracle", "injection").make(twin.rules, np.random.default_rng(0), env.core)
+    while env.core.t < env.world.n_steps:
+        best = twin.trial_errors(np.arange(120)).argmin()
+        assert policy.act(observation) == best
+        twin.act(np.array([best]))
+        observation = env.step(int(best))[0]

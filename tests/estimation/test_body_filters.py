@@ -304,17 +304,3 @@ def test_estimate_finds_the_body():
         darkest = core.task.mesh.points[core.estimate()[0][0].argmin()]
         distances.append(np.linalg.norm(darkest - path.centres[core.t]))
     assert np.median(distances) < 0.01
-
-
-@pytest.mark.parametrize("id", [ID, SEARCH])
-def test_trial_errors_are_those_of_actions_without_noise(id):
-    core, _ = believed(id)
-    while core.t < core.world.warm_up:
-        core.act(np.array([core.t % 120]))
-    trials = core.trial_errors(np.array([7, 100]))
-    np.testing.assert_array_equal(core.trial_errors(np.array([7, 100])), trials)      # nothing advances
-    core.load_until(core.t + 1)
-    core._draws[core.t] = 0.0
-    core.act(np.array([100]))
-    assert core.errors()[0] == pytest.approx(trials[1], rel=1e-9)
-    assert trials[0] != pytest.approx(trials[1], rel=1e-3)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from copy import copy
+
 import numpy as np
 
 from eitbench.worlds.instrument import Instrument
@@ -49,6 +51,12 @@ class ElectrodeFaults:
         # an open input without interference measures zero
         self._interference_variance = max(instrument.interference, instrument.noise_floor, 1e-6)**2
         self._instrument = instrument
+
+    def repeat(self, count: int) -> ElectrodeFaults:
+        """Return the probabilities in ``count`` copies of the first episode."""
+        copies = copy(self)
+        copies.probabilities = np.repeat(self.probabilities[:1], count, axis=0)
+        return copies
 
     def weights(self, driven: np.ndarray, probabilities: np.ndarray | None = None) -> np.ndarray:
         """Return the expected inverse noise variance (..., L) of each measurement, relative to an
