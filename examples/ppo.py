@@ -109,9 +109,12 @@ if __name__ == "__main__":
     parser.add_argument("--episodes", type=int, default=256, help="number of training episodes")
     parser.add_argument("--dev", default="dev:0-31", help="episodes of the evaluation")
     given = parser.parse_args()
+    space = gym.make(given.env).action_space
+    if not isinstance(space, gym.spaces.Discrete):
+        parser.error(f"--env must be an environment with Discrete actions, got {given.env} "
+                     f"with {space}")
     torch.set_num_threads(1)
     agent = train(gym.make_vec(given.env, num_envs=64, episodes=given.episodes), given.steps)
-    actions = int(gym.make(given.env).action_space.n)
     for name, choose in (("agent", lambda seen: agent(seen).argmax(-1)),
-                         ("random pairs", lambda seen: torch.randint(actions, (len(seen),)))):
+                         ("random pairs", lambda seen: torch.randint(int(space.n), (len(seen),)))):
         print(f"{name}: dev return {mean_return(given.env, choose, parse_seeds(given.dev)):.4f}")
