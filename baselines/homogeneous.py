@@ -21,8 +21,7 @@ class Estimator(SequentialEstimator):
         self.record.append((voltages, currents))
         if self.measured % len(task.currents) == 0 or self.measured == task.n_steps:
             V, I = (np.array(part) for part in zip(*self.record, strict=True))
-            self.c_bh = best_homogeneous(task.observation, task.noise, task.mesh.n_nodes, V, I,
-                                         self.c_bh)
+            self.c_bh = best_homogeneous(task.observation, task.noise, V, I, self.c_bh)
 
     def estimate(self, lag: int = 0) -> Estimate:
         return Estimate(np.full(self.task.mesh.n_nodes, self.c_bh))

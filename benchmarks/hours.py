@@ -32,11 +32,10 @@ class Estimator:
 
     def update(self, voltages, currents):
         task = self.task
-        n = task.mesh.n_nodes
-        found = best_homogeneous(task.observation, task.noise, n, voltages[None], currents[None],
+        found = best_homogeneous(task.observation, task.noise, voltages[None], currents[None],
                                  self.level)
         self.level += 0.2 * (found - self.level)
-        return Estimate(np.full(n, self.level))
+        return Estimate(np.full(task.mesh.n_nodes, self.level))
 '''
 SHORT = """
 total_steps: 6144

@@ -128,7 +128,7 @@ class ErrorBudget:
         the only error."""
         task = replace(self.task, noise=noise)
         first = measurements[:task.calibration]
-        c_ref = best_homogeneous(task.observation, noise, task.mesh.n_nodes,
+        c_ref = best_homogeneous(task.observation, noise,
                                  np.concatenate([voltages for voltages, _ in first]),
                                  np.concatenate([currents for _, currents in first]),
                                  task.expected_concentration)

@@ -62,8 +62,8 @@ def main() -> None:
             clean = task.currents @ episode.transfer_resistance[state - 1]
             random = np.random.default_rng(np.random.SeedSequence([seed, state]))
             voltages = clean + PIPE_2D.noise.std(clean) * random.standard_normal(clean.shape)
-            c_bh = best_homogeneous(task.observation, task.noise, task.mesh.n_nodes, voltages,
-                                    task.currents, task.expected_concentration)
+            c_bh = best_homogeneous(task.observation, task.noise, voltages, task.currents,
+                                    task.expected_concentration)
             start = np.full(task.mesh.n_nodes, c_bh)
             truth = episode.concentration[state][None].astype(float)
             for name, reconstruct in methods.items():

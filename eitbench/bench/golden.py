@@ -212,7 +212,7 @@ def _episode_numbers(world: World, name: str) -> dict[str, Any]:
     voltages = episode_cache.cycle_voltages(world, seed, entries)
     sound = episode_cache.cycle_voltages(world.fault_free, seed, entries)[:world.calibration]
     cycle = world.currents[np.arange(world.calibration) % len(world.currents)]
-    homogeneous = best_homogeneous(task.observation, world.noise, task.mesh.n_nodes, sound, cycle,
+    homogeneous = best_homogeneous(task.observation, world.noise, sound, cycle,
                                    world.expected_concentration)
     level = np.full(task.mesh.n_nodes, homogeneous - world.background)
     mass = episode_cache.score_mass(world)

@@ -213,8 +213,8 @@ class EstimatorOutput:
         truth = env.truth()[states]
         mean = (interpolation @ self.means[states].T).T
         std = (interpolation @ np.sqrt(self.variances[states]).T).T if self.has_std else None
-        homogeneous = best_homogeneous(task.observation, task.noise, task.mesh.n_nodes,
-                                       self.voltages, self.currents, task.expected_concentration)
+        homogeneous = best_homogeneous(task.observation, task.noise, self.voltages,
+                                       self.currents, task.expected_concentration)
         computed = np.array([
             task.observation.voltages(estimate, current[None])[0]
             for estimate, current in zip(self.means[states], self.currents[states], strict=True)])

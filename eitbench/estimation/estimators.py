@@ -38,8 +38,7 @@ class CalibrationFrame:
         if self.complete:
             task = self.task
             V, I = (np.array(part) for part in zip(*self.measurements, strict=True))
-            self.c_ref = best_homogeneous(task.observation, task.noise, task.mesh.n_nodes, V, I,
-                                         self.c_ref)
+            self.c_ref = best_homogeneous(task.observation, task.noise, V, I, self.c_ref)
         return self.complete
 
     @property
@@ -180,10 +179,10 @@ class FrameEstimator(SequentialEstimator):
         if end not in self._images:
             begin = max(0, end - len(task.currents))
             V, I = (np.array(part) for part in zip(*self._record[begin:end], strict=True))
-            n = task.mesh.n_nodes
-            c_bh = best_homogeneous(task.observation, task.noise, n, V, I,
+            c_bh = best_homogeneous(task.observation, task.noise, V, I,
                                     task.expected_concentration)
-            self._images = {end: self._reconstruct(V, I, np.full(n, c_bh))}
+            start = np.full(task.mesh.n_nodes, c_bh)
+            self._images = {end: self._reconstruct(V, I, start)}
         return Estimate(self._images[end])
 
     def frame_end(self, state: int) -> int:

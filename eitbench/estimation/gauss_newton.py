@@ -14,7 +14,7 @@ from scipy.linalg import cho_factor, cho_solve, lu_factor, lu_solve
 from eitbench.estimation.nodal import initial_covariance
 from eitbench.numerics.mesh import Mesh
 from eitbench.numerics.sparse_lu import SparseLU
-from eitbench.physics.observation import VoltageModel, VoltageNoise
+from eitbench.physics.observation import ObservationModel, VoltageModel, VoltageNoise
 from eitbench.worlds.task import Estimate, Task
 
 
@@ -214,7 +214,7 @@ class _NormalEquations:
         return lambda g: grounded.solve(g[:, None])[:, 0] - W @ lu_solve(core, W.T @ g)
 
 
-def best_homogeneous(model: VoltageModel, noise: VoltageNoise, n: int, voltages: np.ndarray,
+def best_homogeneous(model: ObservationModel, noise: VoltageNoise, voltages: np.ndarray,
                      currents: np.ndarray, start: float, *, tolerance: float = 1e-8,
                      max_iterations: int = 30) -> float:
     """Return ĉ_bh = argmin_c Σ ((V − U(c·1))/std)², by Gauss–Newton in ln c (docs/methods.md, 3).
@@ -223,11 +223,9 @@ def best_homogeneous(model: VoltageModel, noise: VoltageNoise, n: int, voltages:
 
     Parameters
     ----------
-    model : VoltageModel
+    model : ObservationModel
     noise
         Noise model with a method ``std(voltages)``, evaluated at the measured voltages.
-    n : int
-        Number of nodes.
     voltages, currents : (K, L)
         Measurements in V, NaN where missing, and injections in A (A/m in 2D).
     start : float
@@ -240,9 +238,9 @@ def best_homogeneous(model: VoltageModel, noise: VoltageNoise, n: int, voltages:
     voltages = np.nan_to_num(voltages)
     c = float(start)
     for _ in range(max_iterations):
-        computed, jacobian = model.linearise(np.full(n, c), patterns)
+        computed, by_log = model.homogeneous(c, patterns)
         residual = (voltages - computed[which]) * weight
-        slope = c * jacobian.sum(axis=2)[which] * weight
+        slope = by_log[which] * weight
         change = float(np.clip((slope * residual).sum() / (slope**2).sum(), -1.0, 1.0))
         c *= float(np.exp(change))
         if abs(change) < tolerance:

@@ -62,6 +62,14 @@ class MeasurementModel:
         return (gain * (potentials @ self.matrix.T) + self.mask[k] * self.offset[k],
                 gain[..., None] * (self.matrix @ jacobian))
 
+    def homogeneous(self, level: float, currents: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return voltages (J, M) in V and their derivatives (J, M) as `ObservationModel` does."""
+        k = self._injection_index(currents)
+        potentials, slope = self.observation.homogeneous(level, currents / self.depth)
+        gain = self.mask[k] * self.gain[k]
+        return (gain * (potentials @ self.matrix.T) + self.mask[k] * self.offset[k],
+                gain * (slope @ self.matrix.T))
+
     def _injection_index(self, currents: np.ndarray) -> list[int]:
         rows = np.ascontiguousarray(currents, dtype=float)
         try:

@@ -139,6 +139,17 @@ class CompleteElectrodeModel:
         fields, grounded = self._fields(conductivity)
         return self._centred(grounded), self._sensitivity(fields @ self._centre.T)
 
+    def scaled_resistance(self, conductivity: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return 𝓡 (L, L) in Ω (Ω·m in 2D) and d𝓡(a σ)/da at a = 1, from one factorisation.
+
+        With K = a D σ + C, where C is the part of the contacts, and K X = E for the currents E, it
+        is −Xᵀ (K − C) X = −𝓡 + Xᵀ C X.
+        """
+        fields, grounded = self._fields(conductivity)
+        columns = np.vstack([fields, grounded])
+        contacts = columns.T @ (self._contact_terms()[:-1, :-1] @ columns)
+        return self._centred(grounded), self._centred(contacts - grounded)
+
     def contact_derivatives(self, conductivity: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return 𝓡 (L, L) and its derivatives (L, L, L) by each electrode's contact impedance.
 

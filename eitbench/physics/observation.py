@@ -139,6 +139,15 @@ class ObservationModel:
         by_node = (by_conductivity * self.conductivity.derivative(c)).reshape(-1, len(c))
         return voltages, (by_node @ self.interpolation).reshape(*voltages.shape, -1)
 
+    def homogeneous(self, level: float, currents: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return voltages (K, L) of the concentration ``level`` at all nodes, in mol/m³, and their
+        derivatives (K, L) by ln c, in V."""
+        c = self._at_eit_nodes(np.full(self.interpolation.shape[1], level))
+        sigma = self.conductivity(c)
+        resistance, by_scale = self.cem.scaled_resistance(sigma)
+        by_log = level * self.conductivity.derivative(c)[0] / sigma[0]
+        return currents @ resistance, by_log * (currents @ by_scale)
+
     def _at_eit_nodes(self, concentration: np.ndarray) -> np.ndarray:
         shape = (*np.shape(concentration)[:-1], self.interpolation.shape[1])
         c = _check.array("concentration", concentration, shape, units="mol/m³")

@@ -79,7 +79,7 @@ def recorded(method, n_steps, missing=None):
     for V, I in zip(voltages, currents, strict=True):
         estimate = estimator.update(V, I)
     first = task.calibration
-    c_ref = best_homogeneous(task.observation, task.noise, n, voltages[:first], currents[:first],
+    c_ref = best_homogeneous(task.observation, task.noise, voltages[:first], currents[:first],
                              task.expected_concentration)
     at_reference = task.observation.linearise(np.full(n, c_ref), currents)
     return estimate, task, type(estimator).__init__.__globals__, c_ref, voltages, *at_reference

@@ -131,7 +131,7 @@ def test_noisy_voltages_give_the_weighted_least_squares_minimum(make):
     expected = scipy.optimize.minimize_scalar(objective, bounds=np.log([5.0, 100.0]), method="bounded",
                                               options={"xatol": 1e-10})
     for start in (10.0, 30.0, 90.0):
-        found = best_homogeneous(model, noise, n, voltages, currents, start)
+        found = best_homogeneous(model, noise, voltages, currents, start)
         assert np.log(found) == pytest.approx(expected.x, abs=1e-6)
 
 
@@ -141,4 +141,4 @@ def test_missing_convergence_is_an_error():
     currents = np.array([[1.0, -1.0, 0.0, 0.0]])
     voltages = model.voltages(np.full(n, 30.0), currents)
     with pytest.raises(RuntimeError, match=r"did not converge in 1 iterations; last change .* mol/m³"):
-        best_homogeneous(model, VoltageNoise(), n, voltages, currents, 10.0, max_iterations=1)
+        best_homogeneous(model, VoltageNoise(), voltages, currents, 10.0, max_iterations=1)

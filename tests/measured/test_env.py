@@ -130,15 +130,19 @@ def test_masked_measurements_have_no_effect(env, measurements):
     rows = MeasurementModel(model.observation, model.currents, model.matrix[kept], model.depth,
                             offset=model.offset[:, kept], gain=model.gain[:, kept])
     c = np.linspace(0.8, 1.2, env.task.mesh.n_nodes) * env.task.expected_concentration
-    for values, expected in zip(model.linearise(c, measurements.currents[:2]),
-                                rows.linearise(c, measurements.currents[:2]), strict=True):
-        np.testing.assert_allclose(values[:, kept], expected)
-        assert not np.delete(values, kept, axis=1).any()
+    for method, point in (("linearise", c), ("homogeneous", c[0])):
+        for values, expected in zip(getattr(model, method)(point, measurements.currents[:2]),
+                                    getattr(rows, method)(point, measurements.currents[:2]), strict=True):
+            np.testing.assert_allclose(values[:, kept], expected)
+            assert not np.delete(values, kept, axis=1).any()
 
 
 def test_jacobian_equals_finite_differences(env, measurements):
     c = np.linspace(0.8, 1.2, env.task.mesh.n_nodes) * env.task.expected_concentration
     _, J = env.task.observation.linearise(c, measurements.currents[:1])
+    _, uniform = env.task.observation.linearise(np.full(len(c), c[0]), measurements.currents[:1])
+    np.testing.assert_allclose(env.task.observation.homogeneous(c[0], measurements.currents[:1])[1],
+                               c[0] * uniform.sum(axis=2), rtol=1e-8, atol=1e-12)
     direction = np.random.default_rng(0).normal(size=len(c))
     step = 1e-4 * env.task.expected_concentration
     ends = [env.task.observation.voltages(c + sign * step * direction, measurements.currents[:1])[0]

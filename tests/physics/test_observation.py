@@ -88,6 +88,18 @@ def test_linearisation_of_the_observation(law):
 
 
 @each_law
+def test_derivatives_of_a_homogeneous_concentration_are_sums_over_the_nodes(law):
+    """The voltages of c·1 by ln c: c times the sum of the derivatives by all nodes, also below the minimum."""
+    model = observation(law)
+    for level in (30.0, 0.5 * model.min_concentration):
+        voltages, jacobian = model.linearise(np.full(model.interpolation.shape[1], level), PATTERNS)
+        computed, by_log = model.homogeneous(level, PATTERNS)
+        assert_allclose(computed, voltages, rtol=1e-12, atol=1e-14 * np.abs(voltages).max())
+        expected = level * jacobian.sum(axis=2)
+        assert_allclose(by_log, expected, atol=1e-10 * np.abs(expected).max())
+
+
+@each_law
 def test_concentration_below_the_minimum_is_replaced(law):
     """Negative and tiny values give a positive σ and the voltages of the minimum concentration,
     with its slope. The arguments are unchanged."""

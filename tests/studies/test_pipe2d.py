@@ -74,7 +74,7 @@ def test_stationary_method_works_on_a_stationary_target():
         clean = task.currents @ episode.transfer_resistance[state - 1]
         rng = np.random.default_rng([SEEDS[0], state])
         voltages = clean + PIPE_2D.noise.std(clean) * rng.standard_normal(clean.shape)
-        c_bh = best_homogeneous(task.observation, task.noise, task.mesh.n_nodes, voltages, task.currents, 30.0)
+        c_bh = best_homogeneous(task.observation, task.noise, voltages, task.currents, 30.0)
         constants.append(np.full(task.mesh.n_nodes, c_bh))
         images.append(gauss_newton(task.observation, voltages, task.currents,
                                    task.noise.std(voltages), penalty, constants[-1]))
