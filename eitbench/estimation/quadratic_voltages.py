@@ -101,6 +101,11 @@ class QuadraticVoltageModel:
             by_c.append((slope + bent @ self._to_modes) / c)
         return np.array(voltages), np.array(by_c)
 
+    def homogeneous(self, level: float, currents: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return voltages (K, L) and their derivatives (K, L) as `ObservationModel` does."""
+        voltages, by_c = self.linearise(np.full(self._to_modes.shape[1], level), currents)
+        return voltages, level * by_c.sum(axis=2)
+
 
 class ScaledVoltageModel(QuadraticVoltageModel):
     """Voltages that are quadratic at any c_ref: 𝓡(c) = e^−ū 𝓖(u), with u = ln(c/c_0), ū its mean
