@@ -71,10 +71,16 @@ class SequentialEstimator:
     def update(self, voltages: np.ndarray, currents: np.ndarray) -> Estimate | None:
         """Return the state t − lag after measurement t, (L,) V and A each; None before the first.
 
-        After the last measurement the arguments are ignored.
+        After the last measurement the arguments are ignored. ``RuntimeError`` after the last state.
         """
+        steps = self.task.n_steps
+        if self._requested == steps:
+            raise RuntimeError(f"update must be called at most {steps + self.task.lag} times, once "
+                               f"for each of the task's {steps} measurements and then "
+                               f"{self.task.lag} times (lag); a task of a world with more "
+                               "schedule.scored_steps is longer")
         self._requested += 1
-        if self.measured == self.task.n_steps:
+        if self.measured == steps:
             estimate = self.estimate(self.measured - self._requested)
             return estimate._replace(innovation=None, innovation_covariance=None)
         self.measured += 1

@@ -1,14 +1,17 @@
 """Gauss–Newton and the best homogeneous estimate agree with closed forms and scipy's minimisers."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import scipy.optimize
 import scipy.sparse as sp
+from eitbench.bench.methods import load_method
 from eitbench.estimation import best_homogeneous, gauss_newton
 from eitbench.numerics.mesh import rectangle_mesh
 from eitbench.physics.cem import CompleteElectrodeModel
 from eitbench.physics.observation import ObservationModel, VoltageNoise
-from models import QuadraticModel
+from models import QuadraticModel, tiny_task
 
 from shapes import RootLaw
 
@@ -142,3 +145,16 @@ def test_missing_convergence_is_an_error():
     voltages = model.voltages(np.full(n, 30.0), currents)
     with pytest.raises(RuntimeError, match=r"did not converge in 1 iterations; last change .* mol/m³"):
         best_homogeneous(model, VoltageNoise(), voltages, currents, 10.0, max_iterations=1)
+
+
+@pytest.mark.parametrize("lag", [0, 2])
+def test_updates_after_the_last_state_are_an_error(lag):
+    """One update for each measurement, and one for each step of the lag; the next one names the limit."""
+    task = replace(tiny_task(), lag=lag)
+    estimator = load_method("homogeneous", "estimation").make(task)
+    voltages = task.observation.voltages(np.full(task.mesh.n_nodes, 30.0), task.currents)
+    for k in range(task.n_steps + lag):
+        estimate = estimator.update(voltages[k % len(voltages)], task.currents[k % len(voltages)])
+        assert (estimate is None) == (k < lag)
+    with pytest.raises(RuntimeError, match=f"update must be called at most {task.n_steps + lag} times"):
+        estimator.update(voltages[0], task.currents[0])
