@@ -130,7 +130,7 @@ class Filter:
 
     def update(self, observation: LinearMeasurement) -> Step:
         """Condition on a measurement that is linear in the concentration near the present one."""
-        return self._condition(*self._residual(observation))
+        return self._condition(*self._residual(observation, self.concentration))
 
     def assimilate(self, voltages: np.ndarray, currents: np.ndarray) -> Step:
         """Predict, and condition on voltages (L,) in V for an injection (L,) in A."""
@@ -150,11 +150,13 @@ class Filter:
     def _linearise(self, voltages: np.ndarray, currents: np.ndarray) -> LinearisedMeasurement:
         """Linearise voltages (L,) in V about the present mean, for an injection (L,) in A."""
         assert self.forward is not None, "forward must be given to assimilate voltages"
-        return self._residual(self.forward(self.concentration, voltages, currents))
+        concentration = self.concentration
+        return self._residual(self.forward(concentration, voltages, currents), concentration)
 
-    def _residual(self, observation: LinearMeasurement) -> LinearisedMeasurement:
+    def _residual(self, observation: LinearMeasurement,
+                  concentration: np.ndarray) -> LinearisedMeasurement:
         H = self.space.jacobian(self.mean, observation.matrix)
-        return observation, H, observation.value - observation.matrix @ self.concentration
+        return observation, H, observation.value - observation.matrix @ concentration
 
     def _condition(self, observation: LinearMeasurement, H: np.ndarray,
                    residual: np.ndarray) -> Step:
