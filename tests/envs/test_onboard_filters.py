@@ -116,7 +116,7 @@ def test_trial_errors_are_those_of_actions_without_noise(name):
 
 
 def test_one_step_oracle_injects_the_best_pair_of_the_reduced_filter():
-    """With the full filter inside too: it plays the same episode with the reduced one."""
+    """The oracle has its own reduced filter of the episode, also where the environment has the full one."""
     env, twin = make("full", FAULTS).unwrapped, make("reduced", FAULTS).unwrapped.core
     observation, _ = env.reset(seed=3)
     twin.reset([3])
