@@ -23,8 +23,7 @@ class Policy(SlugTriggered):
     privileged = True
     role = "reference"
     # Coordinate search on the episodes train:0-31 of Pipe2DInjectionInflowBudget with the reduced
-    # filter; the same search with the white prior improves its error by 0.2 %. Reach in m,
-    # deviations relative to the median of the true concentration.
+    # filter; reach in m, deviations relative to the median of the true concentration.
     parameters: dict[str, Any] = {  # noqa: RUF012
         "pair": [0, 9], "reach": 0.02, "entered": 0.03, "left": 0.2, "quick": 3, "rest": 10,
         "slowest": 8}

@@ -261,8 +261,7 @@ class InjectionCore(EpisodeCore):
         k = self.t
         self.load_until(k + 1)
         currents = self.rules.currents(actions)
-        filters: Any = self._filters
-        trial = filters.repeat(len(actions))
+        trial = self._filters.repeat(len(actions))
         trial.assimilate(self.rules.instrument.measure(
             self.faults, k + 1, self._resistance[k], currents, np.zeros_like(currents),
             self.rules.electrodes(actions)), currents)

@@ -140,29 +140,6 @@ class DenseCovariance(Covariance):
         _mirror(P)
 
 
-def symmetric_product(S: np.ndarray, P: np.ndarray) -> np.ndarray:
-    """Return S P Sᵀ (m, m) for S (m, n) and a symmetric P (n, n)."""
-    if not P.flags.c_contiguous:                    # BLAS would copy it
-        return np.asarray(S @ P @ S.T)
-    half = _times_triangle(S, P) @ S.T
-    return np.asarray(half + half.T)
-
-
-def symmetric_diagonal(S: np.ndarray, P: np.ndarray) -> np.ndarray:
-    """Return the diagonal (m,) of S P Sᵀ for S (m, n) and a symmetric P (n, n)."""
-    return 2.0 * np.einsum("ij,ij->i", _times_triangle(S, P), S)
-
-
-def _times_triangle(S: np.ndarray, P: np.ndarray) -> np.ndarray:
-    """Return S T (m, n), P = T + Tᵀ with a triangle T, for half of the cost of S P. The diagonal of
-    P is halved and restored, without rounding."""
-    diagonal = np.einsum("ii->i", P)
-    diagonal *= 0.5
-    product: np.ndarray = blas.dtrmm(1.0, P.T, S.T)     # BLAS reads arrays transposed
-    diagonal *= 2.0
-    return product.T
-
-
 def _mirror(P: np.ndarray) -> None:
     """Copy the upper triangle of a square matrix to the lower one."""
     for begin, end in pairwise([*range(0, len(P), _BLOCK), len(P)]):

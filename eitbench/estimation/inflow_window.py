@@ -8,12 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.linalg import solve_triangular, toeplitz
 
-from eitbench.estimation.covariance import (
-    Covariance,
-    DenseCovariance,
-    symmetric_diagonal,
-    symmetric_product,
-)
+from eitbench.estimation.covariance import Covariance, DenseCovariance
 from eitbench.estimation.estimators import Measurement
 from eitbench.estimation.filter import Filter, StateSpace
 from eitbench.estimation.gauss_newton import gauss_newton
@@ -121,10 +116,10 @@ class InflowWindow(StateSpace):
         basis, weights = self.response(lag)
         slope = self._by_x(mean, weights, lag)
         here = slice(lag * self.n_modes, (lag + self.response_steps) * self.n_modes)
-        reduced = symmetric_product(slope, covariance.array[here, here])
+        reduced = slope @ covariance.array[here, here] @ slope.T
         if self.residual_covariance is not None:
             reduced = reduced + self.c_ref**2 * self.residual_covariance
-        return symmetric_diagonal(basis, reduced)
+        return ((basis @ reduced) * basis).sum(axis=1)
 
     def covariance_of(self, functionals: np.ndarray, mean: np.ndarray, covariance: Covariance,
                       lag: int = 0) -> np.ndarray:

@@ -73,7 +73,7 @@ class CompleteElectrodeModel:
         self._centre = (np.eye(n_electrodes) - 1.0 / n_electrodes)[:, :-1]
         self._sensitivity = Sensitivity(basis)
         self._last: tuple[np.ndarray, np.ndarray] | None = None
-        self._kept: tuple[np.ndarray, np.ndarray] | None = None
+        self._last_resistance: tuple[np.ndarray, np.ndarray] | None = None
 
     # -- public ------------------------------------------------------------------------------------
 
@@ -83,7 +83,7 @@ class CompleteElectrodeModel:
         made.contact_impedance = self._checked_contacts(contact_impedance)
         contact = made._contact_terms()
         made._constant = contact[self._system.rows, self._system.columns]
-        made._last = made._kept = None
+        made._last = made._last_resistance = None
         return made
 
     def transfer_resistance(self, conductivity: np.ndarray) -> np.ndarray:
@@ -97,10 +97,10 @@ class CompleteElectrodeModel:
         sigma = self._checked_conductivity(conductivity, batched=True)
         if sigma.ndim == 1:
             # the last one is kept: many estimates stay constant during a frame
-            if self._kept is None or not np.array_equal(self._kept[0], sigma):
+            if self._last_resistance is None or not np.array_equal(self._last_resistance[0], sigma):
                 inverse = self._system.port_inverse(self._assemble(sigma))
-                self._kept = sigma.copy(), self._centred(inverse)
-            return self._kept[1].copy()
+                self._last_resistance = sigma.copy(), self._centred(inverse)
+            return self._last_resistance[1].copy()
         flat = sigma.reshape(-1, self.mesh.n_nodes)
         size = self._system.batch
         result = np.concatenate([self._system.port_inverse(self._assemble(flat[k:k + size].T))

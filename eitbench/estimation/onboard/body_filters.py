@@ -3,7 +3,6 @@ injection."""
 
 from __future__ import annotations
 
-from copy import copy
 from functools import cached_property, lru_cache
 
 import numpy as np
@@ -44,13 +43,6 @@ class BodyFilters(EpisodeFilters):
         measured = np.nan_to_num(voltages) != 0.0           # observations have 0 for others
         innovations = self.filter.assimilate(voltages, currents, measured)
         return innovations, np.ones(measured.shape, dtype=bool)
-
-    def repeat(self, count: int) -> BodyFilters:
-        """Return filters of ``count`` copies of the first episode."""
-        copies = copy(self)
-        copies.filter = self.filter.repeat(count)
-        copies._doubt = np.repeat(self._doubt[:1], count, axis=0)
-        return copies
 
     def features(self) -> dict[str, np.ndarray]:
         """Return the features of `EpisodeFilters`, and if the rules include ``gains``, the

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from copy import copy
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 
@@ -48,6 +49,9 @@ class EpisodeFilters:
         Voltages in V of the first frame, the world's cycle.
     """
 
+    filter: Any
+    """batch of filters that has `repeat`, except for full filters"""
+
     def __init__(self, rules: Rules, frames: np.ndarray) -> None:
         B, _, L = frames.shape
         self._rules = rules
@@ -73,6 +77,17 @@ class EpisodeFilters:
     def _start(self, episodes: int) -> None:
         """Create the filters at t = 0."""
         raise NotImplementedError
+
+    def repeat(self, count: int) -> Self:
+        """Return filters of ``count`` copies of the first episode, not of full filters."""
+        copies = copy(self)
+        copies.indices = self.indices[:1] * count
+        copies.c_ref, copies._innovations, copies._doubt = (
+            np.repeat(each[:1], count, axis=0)
+            for each in (self.c_ref, self._innovations, self._doubt))
+        copies.filter = self.filter.repeat(count)
+        copies.faults = self.faults and self.faults.repeat(count)
+        return copies
 
     def assimilate(self, voltages: np.ndarray, currents: np.ndarray) -> None:
         """Predict and condition on voltages (B, L) in V for currents (B, L) in A (A/m in 2D), all

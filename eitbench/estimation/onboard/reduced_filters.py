@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from copy import copy
 from functools import cache, lru_cache
 from typing import Any
 
@@ -56,17 +55,6 @@ class ReducedFilters(EpisodeFilters):
         variance, accepted = self.filter.update(jacobian, used, noise, gate=self._rules.gate)
         self._last = innovation, std, accepted, currents
         return (innovation / np.sqrt(variance)).astype(float), accepted
-
-    def repeat(self, count: int) -> ReducedFilters:
-        """Return filters of ``count`` copies of the first episode."""
-        copies = copy(self)
-        copies.indices = self.indices[:1] * count
-        copies.c_ref, copies._innovations, copies._doubt = (
-            np.repeat(each[:1], count, axis=0)
-            for each in (self.c_ref, self._innovations, self._doubt))
-        copies.filter = self.filter.repeat(count)
-        copies.faults = self.faults and self.faults.repeat(count)
-        return copies
 
     def innovations(self) -> list[Innovation | None]:
         innovation, std, accepted, currents = self._last
