@@ -4,6 +4,9 @@ N pipes with rare slugs share an instrument that injects into one of them in eac
 pair at the inlet; each pipe has its own reduced filter with a learned inflow. The table has the
 mean error of all pipes relative to injections in turn, for policies that see the filters, and for
 one that has the true errors.
+
+The Whittle index of a pipe is the price of an injection at which injecting now and one step later
+have the same mean cost in the long run; the cost is the expected squared error of the filter.
 """
 
 from __future__ import annotations
@@ -28,7 +31,11 @@ ALARMS = (1.0, 1.5, 2.5)
 """RMS of innovations in predicted standard deviations that indicate a slug."""
 BONUSES = (2.0, 4.0)
 """Steps by which a pipe with a slug is preferred."""
-POLICIES = ["largest variance", "largest gain",
+SLUG_VARIANCE, PRIOR, PERSISTENCE = 9.0, 0.2, 0.8
+"""Variance of innovations in a slug relative to the predicted one, probability of a slug in a pipe
+without information, and the part of the deviation from it that remains after a step."""
+POLICIES = ["largest variance", "largest gain", "Whittle index",
+            *(f"Whittle index, slug {bonus}" for bonus in BONUSES),
             *(f"age, alarm {alarm} and {bonus}" for alarm in ALARMS for bonus in BONUSES),
             "true error *"]
 
@@ -60,7 +67,8 @@ def errors(rules: Rules, n_pipes: int, policy: str) -> np.ndarray:
     core.reset(seeds)
     pair = rules.pairs.tolist().index(PAIR)
     first = np.arange(0, len(seeds), n_pipes)
-    age, surprise = np.zeros((2, len(seeds)))
+    age, surprise, cost, steps = np.zeros((4, len(seeds)))
+    slug = np.full(len(seeds), PRIOR)
     scored = []
     for k in range(core.length):
         if policy == "turn":
@@ -71,7 +79,13 @@ def errors(rules: Rules, n_pipes: int, policy: str) -> np.ndarray:
             alarm, bonus = (float(policy.split()[i]) for i in (2, 4))
             index = age + bonus * (surprise > alarm)
         else:
-            index = predicted(core._filters, rules.action_currents[pair])["gain" in policy]
+            total, gain = predicted(core._filters, rules.action_currents[pair])
+            index = gain if "gain" in policy else total
+        if policy.startswith("Whittle"):
+            index = steps * total - cost
+            if "slug" in policy:
+                index = index * (1.0 + float(policy.split()[-1]) * slug)
+            index = index + 1e-9 * age
         chosen = first + np.asarray(index, dtype=float).reshape(-1, n_pipes).argmax(axis=1)
         actions = np.full(len(seeds), len(rules.pairs))                        # no injection
         actions[chosen] = pair
@@ -80,6 +94,13 @@ def errors(rules: Rules, n_pipes: int, policy: str) -> np.ndarray:
         age[chosen] = 0.0
         innovations = core._filters.features()["innovations"][chosen]
         surprise[chosen] = np.sqrt((innovations**2).mean(axis=1))
+        slug = PRIOR + PERSISTENCE * (slug - PRIOR)
+        ratio = surprise[chosen]**2 * (1.0 - 1.0 / SLUG_VARIANCE) - np.log(SLUG_VARIANCE)
+        odds = slug[chosen] / (1.0 - slug[chosen]) * np.exp(0.5 * np.clip(ratio, -10.0, 10.0))
+        slug[chosen] = odds / (1.0 + odds)
+        if policy.startswith("Whittle"):
+            cost, steps = cost + total, steps + 1.0
+            cost[chosen], steps[chosen] = (total - gain)[chosen], 1.0
         scored.append(core.errors())
     return np.nanmean(scored, axis=0).reshape(-1, n_pipes).mean(axis=1)
 

@@ -157,14 +157,15 @@ def step_dtype(world: World, n_nodes: int) -> np.dtype:
 
 
 def prefix_file(world: World, needed: int = 0) -> cache.File:
-    """Return the file of the shipped prefix: transfer resistances of the ``needed`` steps and
-    `EXTRA_STEPS` more, without scored ones."""
+    """Return the file of the shipped prefix: the upper triangles of the transfer resistances, which
+    are symmetric, of the ``needed`` steps and `EXTRA_STEPS` more, without scored ones."""
     def build() -> dict[str, np.ndarray]:
         steps = min(needed + EXTRA_STEPS, world.warm_up)
         (episode,) = simulate_batch(world.truth_config, [BUNDLED_SEED], False, steps)
-        return {"transfer_resistance": episode.transfer_resistance}
+        upper = np.triu_indices(world.vessel.n_electrodes)
+        return {"upper": episode.transfer_resistance[:, *upper]}
 
-    key = cache.model_key("beginning", cache.config_dict(world.truth_config), cache.SIMULATION)
+    key = cache.model_key("prefix", cache.config_dict(world.truth_config), cache.SIMULATION)
     return cache.File(key, build)
 
 
@@ -175,9 +176,12 @@ def _shipped(world: World) -> np.ndarray | None:
     arrays = cache.load_shipped(prefix_file(world).key)
     if arrays is None:
         return None
-    resistance = arrays["transfer_resistance"]
+    L = world.vessel.n_electrodes
+    row, column = np.triu_indices(L)
+    resistance = np.empty((len(arrays["upper"]), L, L))
+    resistance[:, row, column] = resistance[:, column, row] = arrays["upper"]
     random = episode_streams(BUNDLED_SEED).noise
-    noise = random.standard_normal((world.n_steps, resistance.shape[1]))
+    noise = random.standard_normal((world.n_steps, L))
     entries = np.zeros(len(resistance), step_dtype(world, scoring_constants(world).mass.shape[0]))
     entries["transfer_resistance"] = resistance
     entries["noise"] = noise[:len(resistance)]
