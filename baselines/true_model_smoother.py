@@ -58,8 +58,9 @@ class Estimator:
     def from_inflows(self, task: Task, revealed, steady: bool, prior) -> np.ndarray:
         responses = ([steady_response(revealed.transport(1))] if steady
                      else time_varying_responses(revealed.transport, task.n_steps))
-        states = map_inflow(task, prior, self.first.c_ref, self.record, responses)
-        return np.array([state.mean for state in states])
+        smoother = map_inflow(task, prior, self.first.c_ref, self.record, responses)
+        return np.array([smoother.space.concentration(smoother.mean, lag)
+                         for lag in reversed(range(len(self.record)))])
 
     def from_states(self, task: Task, revealed, steady: bool) -> np.ndarray:
         start = (nodal_filter(revealed.transport(1), task.prior, self.first.c_ref) if steady

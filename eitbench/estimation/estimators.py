@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from eitbench.estimation.filter import Filter
 from eitbench.estimation.gauss_newton import best_homogeneous
 from eitbench.worlds.task import Estimate, Task
 
@@ -137,13 +138,16 @@ class RecordSmoother:
     Parameters
     ----------
     smooth : callable
-        Measurements t = 1 … T -> the estimates of their states.
+        Measurements t = 1 … T -> the estimates of their states, or a `Filter` that has them.
     """
 
-    def __init__(self, smooth: Callable[[Sequence[Measurement]], Sequence[Estimate]]) -> None:
+    def __init__(self, smooth: Callable[[Sequence[Measurement]],
+                                        Sequence[Estimate] | Filter]) -> None:
         self._smooth = smooth
         self._record: list[Measurement] = []
-        self._estimates: Sequence[Estimate] = ()
+        self._states: Sequence[Estimate] | Filter = ()
+        self._smoothed = 0
+        """number of measurements that the states are conditioned on"""
 
     def assimilate(self, voltages: np.ndarray, currents: np.ndarray) -> None:
         """Store a measurement vector."""
@@ -151,9 +155,17 @@ class RecordSmoother:
 
     def estimate(self, lag: int = 0) -> Estimate:
         """Return the state ``lag`` steps before the last, given all measurements so far."""
-        if len(self._estimates) < len(self._record):
-            self._estimates = self._smooth(self._record)
-        return self._estimates[-1 - lag]
+        if self._smoothed < len(self._record):
+            self._states, self._smoothed = self._smooth(self._record), len(self._record)
+        states = self._states
+        found = states.estimate(lag) if isinstance(states, Filter) else states[-1 - lag]
+        return found._replace(innovation=None, innovation_covariance=None)
+
+    def covariance_of(self, functionals: np.ndarray, lag: int = 0) -> np.ndarray | None:
+        """Return the covariance (m, m) of ``functionals`` (m, n) of the concentration that
+        `estimate` returns; None for estimates without one."""
+        states = self._states
+        return states.covariance_of(functionals, lag) if isinstance(states, Filter) else None
 
 
 class FrameEstimator(SequentialEstimator):

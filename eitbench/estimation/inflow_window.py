@@ -16,7 +16,7 @@ from eitbench.estimation.gaussian import Forward, linearise_at_prediction
 from eitbench.estimation.identified import IdentifiedModel
 from eitbench.estimation.inflow_prior import InflowPrior
 from eitbench.estimation.inflow_response import ImpulseResponse, steady_response
-from eitbench.worlds.task import Estimate, Task
+from eitbench.worlds.task import Task
 
 STEP_TOLERANCE = 1e-3
 """Stop if no inflow changes by more in an iteration, in prior standard deviations."""
@@ -190,8 +190,9 @@ def full_window_filter(task: Task, prior: InflowPrior, c_ref: float, record: Seq
 
 def map_inflow(task: Task, prior: InflowPrior, c_ref: float, record: Sequence[Measurement],
                responses: Sequence[ImpulseResponse] | None = None,
-               model: IdentifiedModel | None = None) -> list[Estimate]:
-    """Return the states t = 1 … T of a measurement sequence from `maximise_posterior`.
+               model: IdentifiedModel | None = None) -> Filter:
+    """Return the filter at the end of a measurement sequence from `maximise_posterior`: its
+    `Filter.estimate` and `Filter.covariance_of` have all states.
 
     ``ValueError`` if the model linearises voltages only once.
     """
@@ -200,8 +201,7 @@ def map_inflow(task: Task, prior: InflowPrior, c_ref: float, record: Sequence[Me
                          "whose voltages are linearised once")
     smoother = full_window_filter(task, prior, c_ref, record, responses, model)
     maximise_posterior(smoother, task, record)
-    return [smoother.estimate(lag)._replace(innovation=None, innovation_covariance=None)
-            for lag in reversed(range(len(record)))]
+    return smoother
 
 
 def maximise_posterior(smoother: Filter, task: Task, record: Sequence[Measurement]) -> None:
