@@ -6,7 +6,8 @@ from eitbench.estimation import (
     FilterEstimator,
     LinearisedForwardModel,
     RecordSmoother,
-    fixed_interval_smoother,
+    SmoothedStates,
+    kalman_filter,
     nodal_filter,
 )
 
@@ -27,5 +28,5 @@ def start(task: Task, c_ref: float) -> RecordSmoother:
     """Return the smoother for a best homogeneous estimate in mol/m³."""
     filter_ = nodal_filter(task.transport, task.prior, c_ref)
     linear = LinearisedForwardModel(task.observation, task.noise, filter_.mean)
-    return RecordSmoother(lambda record: fixed_interval_smoother(
-        filter_, [linear(*measurement) for measurement in record]))
+    return RecordSmoother(lambda record: SmoothedStates(
+        filter_, kalman_filter(filter_, [linear(*measurement) for measurement in record])))

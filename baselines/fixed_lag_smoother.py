@@ -5,10 +5,10 @@ import numpy as np
 from eitbench import Estimate, Task
 from eitbench.estimation import (
     FilterEstimator,
+    SmoothedStates,
     Step,
     linearise_at_reference,
     nodal_filter,
-    smooth_state,
 )
 
 
@@ -33,4 +33,8 @@ class FixedLagSmoother:
         self.steps = [*self.steps[-self.lag:], step]
 
     def estimate(self, lag: int = 0) -> Estimate:
-        return smooth_state(self.filter, self.steps[-lag - 1:])
+        self.smoothed = SmoothedStates(self.filter, self.steps[-lag - 1:])
+        return self.smoothed.estimate(lag)
+
+    def covariance_of(self, functionals: np.ndarray, lag: int = 0) -> np.ndarray:
+        return self.smoothed.covariance_of(functionals, lag)

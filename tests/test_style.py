@@ -9,14 +9,14 @@ import pytest
 
 ROOT = Path(__file__).parent.parent
 PACKAGE = ROOT / "eitbench"
-BUDGETS = {"numerics": 1658, "scoring": 205, "physics": 1713, "worlds": 2782, "data": 1489, "estimation": 6878,
+BUDGETS = {"numerics": 1658, "scoring": 205, "physics": 1713, "worlds": 2782, "data": 1489, "estimation": 6881,
            "measured": 2098, "envs": 1686, "bench": 4744, "report": 2741, "rl": 870, "cli": 1013}
 """Package (or module) -> lines of Python allowed, blank lines and docstrings included. Each imports only from those
 before it."""
 TOP = 433
 """Lines allowed in the other modules at the top: public names, argument checks, files, messages."""
-BASELINES = 2218
-TESTS = 19_825
+BASELINES = 2223
+TESTS = 19_827
 MODULES = {".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__"): path
            for path in PACKAGE.rglob("*.py")}
 

@@ -75,11 +75,7 @@ from eitbench.estimation.nodal import (
     nodal_states,
 )
 from eitbench.estimation.quadratic_voltages import QuadraticVoltageModel, ScaledVoltageModel
-from eitbench.estimation.smoother import (
-    fixed_interval_smoother,
-    smooth_means,
-    smooth_state,
-)
+from eitbench.estimation.smoother import SmoothedStates, fixed_interval_smoother, smooth_means
 from eitbench.estimation.switching_inflow import ParticleInflowFilter, SwitchingInflowFilter
 from eitbench.estimation.unscented import UnscentedFilter
 from eitbench.estimation.velocity import (
@@ -94,20 +90,19 @@ from eitbench.estimation.walk import smoothness_covariance
 __all__ = [
     "BodyTracker", "CalibrationFrame", "DenseCovariance", "EnsembleFilter", "Filter",
     "FilterEstimator", "FilterFeatures", "FrameEstimator", "IdentifiedModel", "ImpulseResponse",
-    "InflowEstimator", "InflowPrior", "InflowWindow", "LinearMeasurement",
-    "LinearisedForwardModel", "LogStates",
-    "LowRankCovariance", "Motion", "NetworkCorrectedFilter", "NetworkEstimator", "NodalStates",
-    "OpenLoopCovariance", "ParticleInflowFilter", "QuadraticVoltageModel", "RecordSmoother",
-    "Regimes", "ScaledVoltageModel", "SequentialEstimator", "StateSpace", "StationaryMap", "Step",
-    "SwitchingInflowFilter", "UnscentedFilter", "VelocityInflowWindow", "VelocityPrior",
-    "VelocityStates", "VoltageFeatures", "apply_correction", "best_homogeneous",
-    "compatible_models", "compatible_priors", "condition", "fit_inflow_prior",
-    "fit_prior_from_episodes", "fixed_interval_smoother", "flow_motion", "full_window_filter",
-    "gauss_newton", "gru_step", "identify_model", "inflow_filter", "initial_covariance",
-    "initial_hidden_state", "innovate", "kalman_filter", "linearise_at_prediction",
-    "linearise_at_reference", "linearise_voltages", "load_network", "map_inflow",
-    "maximise_posterior", "modal_states", "nearest_observed", "network_matches_task",
+    "InflowEstimator", "InflowPrior", "InflowWindow", "LinearMeasurement", "LinearisedForwardModel",
+    "LogStates", "LowRankCovariance", "Motion", "NetworkCorrectedFilter", "NetworkEstimator",
+    "NodalStates", "OpenLoopCovariance", "ParticleInflowFilter", "QuadraticVoltageModel",
+    "RecordSmoother", "Regimes", "ScaledVoltageModel", "SequentialEstimator", "SmoothedStates",
+    "StateSpace", "StationaryMap", "Step", "SwitchingInflowFilter", "UnscentedFilter",
+    "VelocityInflowWindow", "VelocityPrior", "VelocityStates", "VoltageFeatures",
+    "apply_correction", "best_homogeneous", "compatible_models", "compatible_priors", "condition",
+    "fit_inflow_prior", "fit_prior_from_episodes", "fixed_interval_smoother", "flow_motion",
+    "full_window_filter", "gauss_newton", "gru_step", "identify_model", "inflow_filter",
+    "initial_covariance", "initial_hidden_state", "innovate", "kalman_filter",
+    "linearise_at_prediction", "linearise_at_reference", "linearise_voltages", "load_network",
+    "map_inflow", "maximise_posterior", "modal_states", "nearest_observed", "network_matches_task",
     "nodal_filter", "nodal_states", "one_step", "reduced_response", "scaled_velocity_prior",
-    "smooth_means", "smooth_state", "smoothness_covariance", "steady_response",
-    "task_velocity_prior", "time_varying_responses", "total_variation",
+    "smooth_means", "smoothness_covariance", "steady_response", "task_velocity_prior",
+    "time_varying_responses", "total_variation",
 ]

@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 
-from eitbench.estimation.filter import Filter
 from eitbench.estimation.gauss_newton import best_homogeneous
 from eitbench.worlds.task import Estimate, Task
 
@@ -138,14 +137,14 @@ class RecordSmoother:
     Parameters
     ----------
     smooth : callable
-        Measurements t = 1 … T -> the estimates of their states, or a `Filter` that has them.
+        Measurements t = 1 … T -> the estimates of their states, or an object with
+        ``estimate(lag)`` and ``covariance_of(functionals, lag)``, such as a `Filter`.
     """
 
-    def __init__(self, smooth: Callable[[Sequence[Measurement]],
-                                        Sequence[Estimate] | Filter]) -> None:
+    def __init__(self, smooth: Callable[[Sequence[Measurement]], Any]) -> None:
         self._smooth = smooth
         self._record: list[Measurement] = []
-        self._states: Sequence[Estimate] | Filter = ()
+        self._states: Any = ()
         self._smoothed = 0
         """number of measurements that the states are conditioned on"""
 
@@ -158,14 +157,14 @@ class RecordSmoother:
         if self._smoothed < len(self._record):
             self._states, self._smoothed = self._smooth(self._record), len(self._record)
         states = self._states
-        found = states.estimate(lag) if isinstance(states, Filter) else states[-1 - lag]
+        found = states[-1 - lag] if isinstance(states, list) else states.estimate(lag)
         return found._replace(innovation=None, innovation_covariance=None)
 
     def covariance_of(self, functionals: np.ndarray, lag: int = 0) -> np.ndarray | None:
         """Return the covariance (m, m) of ``functionals`` (m, n) of the concentration that
         `estimate` returns; None for estimates without one."""
-        states = self._states
-        return states.covariance_of(functionals, lag) if isinstance(states, Filter) else None
+        known = getattr(self._states, "covariance_of", None)
+        return None if known is None else known(functionals, lag)
 
 
 class FrameEstimator(SequentialEstimator):

@@ -14,23 +14,39 @@ from eitbench.estimation.nodal import NodalStates
 from eitbench.worlds.task import Estimate
 
 
+class SmoothedStates:
+    """States of the consecutive ``steps`` of a filter, given the measurements of all these steps:
+    the fixed-interval smoother, and with the last k + 1 steps the fixed-lag smoother.
+
+    The filter must have a `LowRankCovariance` and a time-invariant motion.
+    """
+
+    def __init__(self, filter_: Filter, steps: Sequence[Step]) -> None:
+        self._states = list(_adjoints(filter_, steps))
+
+    def estimate(self, lag: int = 0) -> Estimate:
+        """Return the mean c + P λ and the variances of P − P N P, ``lag`` steps before the last."""
+        step, adjoint = self._states[lag]
+        P = step.predicted_covariance
+        weighted = P.times(adjoint)
+        variance = P.diagonal() - (weighted[:, 1:]**2).sum(axis=1)
+        return Estimate(step.predicted_mean + weighted[:, 0], variance)
+
+    def covariance_of(self, functionals: np.ndarray, lag: int = 0) -> np.ndarray:
+        """Return the covariance (m, m) of ``functionals`` (m, n) of this state."""
+        step, adjoint = self._states[lag]
+        weighted = step.predicted_covariance.times(functionals.T)
+        gained = weighted.T @ adjoint[:, 1:]
+        covariance: np.ndarray = functionals @ weighted - gained @ gained.T
+        return 0.5 * (covariance + covariance.T)
+
+
 def fixed_interval_smoother(start: Filter,
                             observations: Iterable[LinearMeasurement]) -> list[Estimate]:
-    """Return c_{t|T} and its variances for t = 1 … T, by a forward and a backward pass.
-
-    ``start`` must have a `LowRankCovariance` and a time-invariant motion.
-    """
+    """Return c_{t|T} and its variances for t = 1 … T, by a forward and a backward pass."""
     steps = kalman_filter(start, observations)
-    return [_smoothed(step, adjoint) for step, adjoint in _adjoints(start, steps)][::-1]
-
-
-def smooth_state(filter_: Filter, steps: Sequence[Step]) -> Estimate:
-    """Return the state of the first of consecutive ``steps``, given the measurements of all steps.
-
-    With the last k + 1 steps of ``filter_`` this is the fixed-lag smoother c_{t−k|t}.
-    """
-    *_, (step, adjoint) = _adjoints(filter_, steps)
-    return _smoothed(step, adjoint)
+    smoothed = SmoothedStates(start, steps)
+    return [smoothed.estimate(lag) for lag in reversed(range(len(steps)))]
 
 
 def smooth_means(start: Filter, observations: Iterable[LinearMeasurement]) -> np.ndarray:
@@ -78,10 +94,3 @@ def _adjoints(filter_: Filter, steps: Sequence[Step], *,
                                            filter_.covariance.rank_tolerance)
             later = np.column_stack([later[:, 0], information])
         yield step, later
-
-
-def _smoothed(step: Step, adjoint: np.ndarray) -> Estimate:
-    """Return c_{t|t−1} + P λ and the diagonal of P − P N P, with P = P_{t|t−1}."""
-    weighted = step.predicted_covariance.times(adjoint)
-    variance = step.predicted_covariance.diagonal() - (weighted[:, 1:]**2).sum(axis=1)
-    return Estimate(step.predicted_mean + weighted[:, 0], variance)

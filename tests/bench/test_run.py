@@ -198,7 +198,8 @@ def test_uncertainty_of_sections_and_flow():
 @pytest.mark.parametrize(("id", "method"), [
     ("Pipe2DTurbulent", "turbulent_filter"), ("Pipe2DFixedLag", "identified_flow"),
     ("Pipe2D", "adaptive_inflow_filter"), ("Pipe2DIntermittent", "particle_filter"),
-    ("Pipe2DUnknownVelocity", "joint_inflow_filter"), ("Pipe2DSmoothing", "inflow_smoother")])
+    ("Pipe2DUnknownVelocity", "joint_inflow_filter"), ("Pipe2DSmoothing", "inflow_smoother"),
+    ("Pipe2DSmoothing", "fixed_interval_smoother"), ("Pipe2DFixedLag", "fixed_lag_smoother")])
 def test_joint_covariances_include_the_variances(id, method):
     """The covariance of the concentrations at some nodes is positive definite with their variances on the diagonal."""
     short = {"schedule": {"scored_steps": 6}}

@@ -10,6 +10,7 @@ from eitbench.estimation import (
     LogStates,
     Motion,
     NodalStates,
+    SmoothedStates,
     VelocityInflowWindow,
     VelocityStates,
     fixed_interval_smoother,
@@ -17,7 +18,6 @@ from eitbench.estimation import (
     modal_states,
     nodal_filter,
     smooth_means,
-    smooth_state,
 )
 from eitbench.estimation.walk import matern32_transition
 from eitbench.worlds.catalogue import PIPE_2D
@@ -232,7 +232,7 @@ def test_smoothed_means(form):
 
 
 def test_fixed_interval_and_fixed_lag_smoother():
-    """Smoothed means and variances are exact given all measurements, and given the next few measurements."""
+    """Smoothed means and covariances are exact given all measurements, and given the next few measurements."""
     filter_, models = low_rank()
     seen, of_state = measured(filter_, models)
     for ours, theirs in zip(fixed_interval_smoother(filter_, seen), stacked(models, of_state), strict=True):
@@ -242,9 +242,10 @@ def test_fixed_interval_and_fixed_lag_smoother():
     steps = kalman_filter(filter_, seen)
     for lag in (0, 1, 4):
         for t in (lag, 5):
-            state, expected = smooth_state(filter_, steps[t - lag:t + 1]), stacked(models[:t + 1], of_state[:t + 1])
-            assert_close(state.mean, expected[t - lag].mean)
-            assert_close(state.variance, expected[t - lag].variance)
+            states, expected = SmoothedStates(filter_, steps[t - lag:t + 1]), stacked(models[:t + 1], of_state[:t + 1])
+            assert_close(states.estimate(lag).mean, expected[t - lag].mean)
+            assert_close(states.estimate(lag).variance, expected[t - lag].variance)
+            assert_close(states.covariance_of(np.eye(len(filter_.mean)), lag), expected[t - lag].covariance)
 
 
 def test_a_window_is_its_own_smoother():

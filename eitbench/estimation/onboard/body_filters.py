@@ -55,7 +55,7 @@ class BodyFilters(EpisodeFilters):
 
     @cached_property
     def _belief(self) -> BodyBelief:
-        return BodyBelief(self._rules, {}, self)
+        return BodyBelief(self._rules, self)
 
     def innovations(self) -> list[Innovation | None]:
         return [Innovation.of(*each) for each in zip(*self.filter.innovation, strict=True)]
@@ -92,13 +92,13 @@ class BodyBelief:
     """Particles of the environment's filter, and the design criteria of each injection.
 
     It is created from the first raw observation of an episode and updated with every later one; or
-    from the ``filters`` of several episodes.
+    from the filters of several episodes.
     """
 
-    def __init__(self, rules: Rules, observation: dict[str, np.ndarray],
-                 filters: BodyFilters | None = None) -> None:
+    def __init__(self, rules: Rules, start: dict[str, np.ndarray] | BodyFilters) -> None:
         self.rules = rules
-        self._filters = filters or BodyFilters(rules, observation["frame"][None])
+        self._filters = (start if isinstance(start, BodyFilters)
+                         else BodyFilters(rules, start["frame"][None]))
         model = self._filters.filter.model
         entries, number = symmetric_entries(len(model.resistance))
         signals = rules.amplitude * model.signals[entries]
