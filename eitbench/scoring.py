@@ -7,7 +7,6 @@ import math
 from typing import Any
 
 import numpy as np
-from scipy.optimize import linear_sum_assignment
 from scipy.special import ndtr, ndtri
 
 ENERGY_DRAWS = 100
@@ -188,6 +187,7 @@ def matched_distances(estimates: np.ndarray, truths: np.ndarray,
 
 def _matched(estimates: np.ndarray, truths: np.ndarray, cutoff: float = np.inf) -> np.ndarray:
     """Return the distances, at most ``cutoff``, of the assignment with the least sum of squares."""
+    from scipy.optimize import linear_sum_assignment  # lazy import: takes half a second
     distances = np.minimum(np.linalg.norm(estimates[:, None] - truths, axis=-1), cutoff)
     return np.asarray(distances[linear_sum_assignment(distances**2)])
 

@@ -10,7 +10,6 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-from scipy.optimize import least_squares, nnls
 
 from eitbench import _check
 from eitbench.measured.measurements import check_voltages
@@ -140,6 +139,7 @@ def calibrate(electrodes: CompleteElectrodeModel, currents: np.ndarray, matrix: 
     def jacobian(x: np.ndarray) -> np.ndarray:
         return np.vstack([(weight * model(x)[1])[:, used].T, root_precision])
 
+    from scipy.optimize import least_squares  # lazy import: takes half a second
     x = prior_mean
     for _ in range(2):                   # the second fit has weights from the misfit of the first
         x = least_squares(residuals, x, jacobian, loss="soft_l1", xtol=1e-8, ftol=1e-8).x
@@ -205,6 +205,7 @@ def _fit_noise(variance: np.ndarray, size: np.ndarray) -> VoltageNoise:
     voltages equally."""
     typical = variance.mean() * (0.1 + size**2 / np.mean(size**2))
     terms = np.stack([size**2, np.ones_like(size)], axis=1) / typical[:, None]
+    from scipy.optimize import nnls  # lazy import: takes half a second
     (relative, floor), _ = nnls(terms, variance / typical)
     lowest = 1e-6 * size.max()
     return VoltageNoise(float(np.sqrt(relative)), 0.0, float(max(np.sqrt(floor), lowest)))

@@ -8,7 +8,6 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from scipy.optimize import minimize, minimize_scalar
 
 from eitbench import _check
 from eitbench.estimation.gaussian import LinearisedForwardModel, condition, innovate
@@ -147,6 +146,7 @@ def maximise_evidence(task: Task, measurements: Measurements, free: list[str],
         phi = _ar_coefficient(values["initial"], values["walk"])
         return evidence(values["noise"], values["initial"], partial(_ar1_transition, phi))
 
+    from scipy.optimize import minimize  # lazy import: takes half a second
     optimum = minimize(objective, np.log([INITIAL_GUESS[name] for name in free]),
                        method="Nelder-Mead", bounds=np.log([limits[name] for name in free]),
                        options={"xatol": 0.03, "fatol": 0.1, "maxfev": 60 * len(free)})
@@ -165,6 +165,7 @@ def maximise_rate_evidence(task: Task, measurements: Measurements) -> float:
     noise and initial standard deviation."""
     evidence = _NegTwoLogEvidence(task, measurements)
     frame = max(task.warm_up, 1)
+    from scipy.optimize import minimize_scalar  # lazy import: takes half a second
     optimum = minimize_scalar(
         lambda x: evidence(1.0, task.prior.initial_std,
                            lambda steps: matern32_transition(np.exp(x) * steps)),
