@@ -177,6 +177,7 @@ class IdentifiedModel:
             raise ValueError(f"{path} must be a model of `eitbench fit model`: {error}") from None
 
 
+@lru_cache(maxsize=1)  # many methods compare it with their files, one after the other
 def task_fingerprint(task: Task) -> np.ndarray:
     """Return a fingerprint of a task's vessel, injections and flow: homogeneous voltages relative
     to the largest, and the position (m) of a blob from the middle after one time step."""
