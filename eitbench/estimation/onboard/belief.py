@@ -59,28 +59,32 @@ def pair_design_criteria(
     return gains, 0.5 * np.linalg.slogdet(S)[1]
 
 
-def best_electrodes(voltage_covariance: np.ndarray, weighted_voltage_covariance: np.ndarray,
-                    entries: tuple[np.ndarray, np.ndarray], noise_variance: np.ndarray,
-                    count: int) -> np.ndarray:
-    """Return the places (p, count) of voltages of each pair among its m: the first has the
-    largest A-criterion, and each further one increases the criterion most. Arguments as in
-    `pair_design_criteria`."""
+def best_electrodes(
+        voltage_covariance: np.ndarray, weighted_voltage_covariance: np.ndarray,
+        entries: tuple[np.ndarray, np.ndarray], noise_variance: np.ndarray,
+        count: int) -> tuple[np.ndarray, tuple[np.ndarray, np.ndarray]]:
+    """Return the places (p, count) of voltages of each pair among its m, and the A- and D-criterion
+    (p,) of these voltages: the first one has the largest A-criterion, and each further one
+    increases the criterion most. Arguments as in `pair_design_criteria`."""
     S, W = _whitened(entries, noise_variance, voltage_covariance, weighted_voltage_covariance)
     pairs = np.arange(len(S))
     free = np.ones(S.shape[:2], dtype=bool)
     chosen = np.empty((len(S), count), dtype=int)
+    gains, information = np.zeros((2, len(S)))
     for k in range(count):
         variance = np.diagonal(S, axis1=1, axis2=2) + 1.0
-        gains = np.where(free, np.diagonal(W, axis1=1, axis2=2) / variance, -1.0)
-        best = chosen[:, k] = gains.argmax(axis=1)
+        increase = np.where(free, np.diagonal(W, axis1=1, axis2=2) / variance, -1.0)
+        best = chosen[:, k] = increase.argmax(axis=1)
         free[pairs, best] = False
+        gains += increase[pairs, best]
+        information += 0.5 * np.log(variance[pairs, best])
         # condition on this voltage: S − s sᵀ/σ², and likewise the rows and columns of W
         row, weighted = S[pairs, best], W[pairs, best]
         share = row / variance[pairs, best, None]
         W = (W - share[:, :, None] * weighted[:, None] - weighted[:, :, None] * share[:, None]
              + weighted[pairs, best, None, None] * share[:, :, None] * share[:, None])
         S = S - share[:, :, None] * row[:, None]
-    return chosen
+    return chosen, (gains, information)
 
 
 def _whitened(entries: tuple[np.ndarray, np.ndarray], noise_variance: np.ndarray,

@@ -149,7 +149,6 @@ class BodyBelief:
         tables = covariance, cross @ cross.T
         if not self.rules.chooses_readings:
             return pair_design_criteria(*tables, self._entries, noise)
-        self.electrodes = best_electrodes(*tables, self._entries, noise,
-                                          self.rules.instrument.n_voltmeters)
-        i, j, noise = (np.take_along_axis(each, self.electrodes, axis=1) for each in (i, j, noise))
-        return pair_design_criteria(*tables, (i, j), noise)
+        self.electrodes, criteria = best_electrodes(*tables, self._entries, noise,
+                                                    self.rules.instrument.n_voltmeters)
+        return criteria
