@@ -105,8 +105,8 @@ def train(
 ) -> None:
     """Train an agent to choose injections.
 
-    The same command resumes from the last checkpoint. Episodes that `eitbench bank` has not stored
-    are simulated when they begin. The folder receives model.zip, config.json, evaluations.npz
+    The same command resumes from the last checkpoint. Missing episodes are simulated on one core;
+    `eitbench bank` uses all cores. The folder receives model.zip, config.json, evaluations.npz
     (scores on dev episodes), K.monitor.csv (training episodes of the K-th start, with rewards times
     reward_scale) and logs for TensorBoard.
     """

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from tqdm import tqdm
@@ -69,6 +70,17 @@ def presimulate(world: World, seeds: Sequence[int], *, n_jobs: int = 1, backend:
     return len(missing)
 
 
+def presimulate_if_writable(world: World, seeds: Sequence[int], **options: Any) -> bool:
+    """Call `presimulate` and return True; or warn and return False if the cache folder cannot be
+    written, so that episodes are simulated when they begin."""
+    try:
+        presimulate(world, seeds, **options)
+    except OSError as error:
+        cache.warn_cache_unwritable(cache.folder(world), error)
+        return False
+    return True
+
+
 def _simulate_and_store(world: World, seeds: Sequence[int], folder: Path, progress: bool) -> int:
     """Simulate and store episodes, and return their number."""
     with cache.use_cache_dir(folder):
@@ -127,9 +139,5 @@ class EpisodeSampler:
             return
         has_common_flow = type(world.flow).draw is Flow.draw and world.target.is_advected
         is_cheap = has_common_flow and scoring_constants(world).mass.shape[0] < LARGE_MESH_NODES
-        try:
-            presimulate(world, range(max(self._n_candidates, BATCH_SIZE * is_cheap)),
-                        show_steps=True)
-        except OSError as error:
-            self._can_store = False
-            cache.warn_cache_unwritable(cache.folder(world), error)
+        wanted = range(max(self._n_candidates, BATCH_SIZE * is_cheap))
+        self._can_store = presimulate_if_writable(world, wanted, show_steps=True)

@@ -44,6 +44,7 @@ from tqdm import tqdm
 
 from eitbench import _check
 from eitbench._files import resolve_input, write_atomically
+from eitbench.data.presimulation import presimulate_if_writable
 from eitbench.data.seeds import SPLITS
 from eitbench.envs.injection import InjectionEnv, InjectionVectorEnv
 from eitbench.rl.imitation import check_imitation, imitate, load_compatible_policy, rollout
@@ -191,6 +192,8 @@ def train(env: str, algo: str, config: TrainingConfig, seed: int, folder: Path,
     start = len(list(folder.glob("*.monitor.csv")))
     learning.results_writer = ResultsWriter(
         str(folder / f"{start}.monitor.csv"), header={"t_start": learning.t_start, "env_id": env})
+    if config.reference or config.imitate:  # they play the training episodes one by one
+        presimulate_if_writable(world.world, SPLITS["train"][:config.episodes])
     if config.reference:
         inner.reference = policy_rewards(config.reference, world)
     if is_new:
@@ -243,6 +246,7 @@ def make_evaluator(env: str, kwargs: dict[str, Any] | None,
     envs = vector_env(env, kwargs, config, len(seeds))
 
     def evaluate(model: BaseAlgorithm) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        presimulate_if_writable(envs.world, seeds)
         observation, _ = envs.reset(seed=seeds)
         returns = np.zeros(len(seeds))
         state = None
