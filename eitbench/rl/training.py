@@ -192,7 +192,7 @@ def train(env: str, algo: str, config: TrainingConfig, seed: int, folder: Path,
     start = len(list(folder.glob("*.monitor.csv")))
     learning.results_writer = ResultsWriter(
         str(folder / f"{start}.monitor.csv"), header={"t_start": learning.t_start, "env_id": env})
-    if config.reference or config.imitate:  # they play the training episodes one by one
+    if config.reference or config.imitate:  # they run the training episodes one by one
         presimulate_if_writable(world.world, SPLITS["train"][:config.episodes])
     if config.reference:
         inner.reference = policy_rewards(config.reference, world)
