@@ -157,7 +157,7 @@ class RecordSmoother:
         if self._smoothed < len(self._record):
             self._states, self._smoothed = self._smooth(self._record), len(self._record)
         states = self._states
-        found = states[-1 - lag] if isinstance(states, list) else states.estimate(lag)
+        found = states.estimate(lag) if hasattr(states, "estimate") else states[-1 - lag]
         return found._replace(innovation=None, innovation_covariance=None)
 
     def covariance_of(self, functionals: np.ndarray, lag: int = 0) -> np.ndarray | None:
