@@ -31,19 +31,17 @@ SHARP = 2e-5
 """m, transition of the sharp edge"""
 
 
-def fitted_mesh(mesh: Mesh, centre: np.ndarray, radius: float, sharp: bool) -> Mesh:
+def fitted_mesh(mesh: Mesh, centre: np.ndarray, radius: float, edge: float) -> Mesh:
     """Return a triangulation of the nodes of ``mesh`` of a convex vessel, with rings around a disc
-    in place of its nodes near the disc."""
+    in place of its nodes near the disc; ``edge`` is the transition in m, `SHARP` or wider."""
     wall = mesh.points[np.unique(mesh.boundary_facets)]
     radii = np.concatenate([np.arange(radius, 0.2 * radius, -SPACING)[::-1],
                             np.arange(radius, radius + 2.5 * TRANSITION_WIDTH, SPACING)[1:]])
-    if sharp:
+    if edge == SHARP:
         radii = np.concatenate([radii[radii != radius], radius + np.array([-SHARP, SHARP])])
-    rings = [centre + r * np.stack([np.cos(angle), np.sin(angle)], axis=1)
-             for r in radii
-             for angle in [np.linspace(0.0, 2.0 * np.pi, int(2.0 * np.pi * radius / SPACING),
-                                       endpoint=False)]]
-    ring_nodes = np.concatenate([[centre], *rings])
+    angles = np.linspace(0.0, 2.0 * np.pi, int(2.0 * np.pi * radius / SPACING), endpoint=False)
+    circle = np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    ring_nodes = np.concatenate([[centre], *(centre + r * circle for r in radii)])
     to_wall = np.array([np.hypot(*(wall - node).T).min() for node in ring_nodes])
     inside = Delaunay(wall).find_simplex(ring_nodes) >= 0
     ring_nodes = ring_nodes[inside & (to_wall > SPACING)]
@@ -74,7 +72,7 @@ def errors(world: World, truth: CompleteElectrodeModel, finer: Mesh,
     found = voltages(truth, truth.mesh.points, TRANSITION_WIDTH)
     rows = {}
     for name, edge in (("the mesh of the truth", TRANSITION_WIDTH), ("the smooth edge", SHARP)):
-        mesh = fitted_mesh(finer, path.centres[t], path.radius, edge == SHARP)
+        mesh = fitted_mesh(finer, path.centres[t], path.radius, edge)
         cem = CompleteElectrodeModel(mesh, vessel.electrodes(mesh), vessel.contact_impedance)
         rows[name] = np.sqrt(np.nanmean(
             ((found - voltages(cem, mesh.points, edge)) / std)**2, axis=1))

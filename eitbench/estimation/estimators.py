@@ -144,18 +144,17 @@ class RecordSmoother:
     def __init__(self, smooth: Callable[[Sequence[Measurement]], Any]) -> None:
         self._smooth = smooth
         self._record: list[Measurement] = []
-        self._states: Any = ()
-        self._smoothed = 0
-        """number of measurements that the states are conditioned on"""
+        self._states: Any = None
 
     def assimilate(self, voltages: np.ndarray, currents: np.ndarray) -> None:
         """Store a measurement vector."""
         self._record.append((voltages, currents))
+        self._states = None
 
     def estimate(self, lag: int = 0) -> Estimate:
         """Return the state ``lag`` steps before the last, given all measurements so far."""
-        if self._smoothed < len(self._record):
-            self._states, self._smoothed = self._smooth(self._record), len(self._record)
+        if self._states is None:
+            self._states = self._smooth(self._record)
         states = self._states
         found = states.estimate(lag) if hasattr(states, "estimate") else states[-1 - lag]
         return found._replace(innovation=None, innovation_covariance=None)
