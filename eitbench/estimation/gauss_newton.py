@@ -51,13 +51,14 @@ def gauss_newton(model: VoltageModel, voltages: np.ndarray, currents: np.ndarray
         return float((((voltages - computed).ravel() * weight)**2).sum() + c @ (penalty @ c))
 
     computed, jacobian = model.linearise(c, currents)
-    for _ in range(max_iterations):
+    for iteration in range(max_iterations):
         A = jacobian.reshape(-1, len(c)) * weight[:, None]
         residual = (voltages - computed).ravel() * weight
         gradient = A.T @ residual - penalty @ c
         direction = normal.solve(A, gradient)
         now = misfit(c, computed)
-        last = (gradient @ direction < tolerance * now or np.abs(direction).max() < step_tolerance)
+        last = (gradient @ direction < tolerance * now or np.abs(direction).max() < step_tolerance
+                or iteration == max_iterations - 1)
         length = 1.0
         while True:
             trial = c + length * direction
