@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,7 @@ from PIL import Image
 from threadpoolctl import threadpool_limits
 
 from eitbench import _check
+from eitbench._files import write_atomically
 from eitbench.bench.methods import Method
 from eitbench.bench.run import isolated_job
 from eitbench.bench.tracks import Environment
@@ -48,7 +50,6 @@ def animate(environment: str, methods: Sequence[str], seed: str, step: int | Non
         images = _compared_frames(env, loaded, number, at) if len(loaded) > 1 else [
             np.asarray(env.render()) for t, *_ in run_until(env, loaded[0], number, at[-1])
             if t in at]
-    path.parent.mkdir(parents=True, exist_ok=True)
     frames = list(map(Image.fromarray, images))
     options: dict[str, Any] = {}
     if path.suffix == ".gif":
@@ -59,7 +60,9 @@ def animate(environment: str, methods: Sequence[str], seed: str, step: int | Non
     if step is None:
         options |= {"save_all": True, "append_images": frames[1:], "loop": 0,
                     "duration": every * 1000 // env.metadata["render_fps"]}
-    frames[0].save(path, **options)
+    content = io.BytesIO()
+    frames[0].save(content, path.suffix[1:], **options)
+    write_atomically(path, content.getvalue())
     return path
 
 

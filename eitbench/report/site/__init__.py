@@ -52,6 +52,7 @@ CATEGORY_TEXTS = {
 }
 """Class -> task."""
 HEADLINE_ENVIRONMENT, AGENT_ENVIRONMENT = "eitbench-Pipe2D-v0", "eitbench-Pipe2DInjectionBudget-v0"
+HEADLINE_METHODS = ("homogeneous", "gauss_newton", "extended_kalman_filter")
 HEADLINE = "media/headline.webp", "media/headline.png"
 """Animation of the first page, and its still picture, from the leaderboards' folder."""
 LINKS = {"Submit a method": "README.md", "Statistics": "../docs/statistics.md",
@@ -182,15 +183,20 @@ def index_page(site: Site) -> bytes:
 
 
 def headline(site: Site) -> dict[str, Any] | None:
-    """Return the errors ẽ_c of methods, the ratio of images without and with a flow model, rounded
-    down, and the leaderboard; None without official records."""
-    board = site.board("filter", HEADLINE_ENVIRONMENT)
+    """Return the board of the first page, errors ẽ_c of methods on it, the best filter that ran in
+    all environments, and the ratio, rounded down, of the error of stationary images to its error;
+    None without official records of these."""
+    board, every = (site.board("filter", name) for name in (HEADLINE_ENVIRONMENT, ALL))
+    best = next((row for row in (every.rows if every else ())
+                 if row.is_ranked and row.cells["official"]), None)
     errors = {row.cells["method"]: row.cells["error"] for row in (board.rows if board else ())
               if row.cells["official"] and row.complete}
-    if not {"homogeneous", "gauss_newton", "extended_kalman_filter"} <= errors.keys():
+    if best is None or not {*HEADLINE_METHODS, best.cells["method"]} <= errors.keys():
         return None
-    ratio = int(errors["gauss_newton"] / errors["extended_kalman_filter"])
-    return {"ratio": ratio, "errors": errors, "board": board} if ratio > 1 else None
+    error = errors[best.cells["method"]]
+    ratio = int(errors["gauss_newton"] / error)
+    return None if ratio < 2 else {"ratio": ratio, "board": board, "errors": errors, "best": error,
+                                   "filter": best.cells["title"]}
 
 
 # -- environments ----------------------------------------------------------------------------------
