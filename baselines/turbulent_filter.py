@@ -1,14 +1,16 @@
-"""Log-inflow filter with a dynamic flow error: the concentration error of the mean flow is part of
-the state, an autoregression in principal modes fitted to training episodes.
+"""Log-inflow filter with unknown eddies: flow and error of the concentration are part of the state.
 
-Approximation errors that persist are estimated with the state (Huttunen & Kaipio, Inverse Problems
-and Imaging 1, 2007). `studies/turbulence.py` fits the modes.
+The velocity is the mean flow and modes of eddies with coefficients b, an autoregression; the
+concentration is c(x) + c_ref B z with the inflow window x of the mean flow, whose error z the
+eddies change. `studies/turbulence.py` fits modes and noise to training episodes.
 """
 
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
 from scipy.linalg import block_diag
+from scipy.sparse.linalg import splu
 
 from eitbench import Task
 from eitbench.estimation import (
@@ -18,36 +20,109 @@ from eitbench.estimation import (
     InflowWindow,
     linearise_at_prediction,
 )
+from eitbench.estimation.inflow_response import steady_response
+from eitbench.numerics.fem import mass_matrix
+from eitbench.physics.transport import ConvectionDiffusion
 
 MODEL = Path(__file__).parent / "models" / "turbulent" / "pipe2dturbulent.npz"
+NOISE_FACTOR = 2.0
+"""Factor of the fitted noise of z, for products of errors, which the covariance omits."""
 
 
-class FlowErrorWindow(InflowWindow):
-    """Inflow window x and errors z_t, z_t−1, …: c = c(x) + c_ref B z_t."""
+def eddy_products(transport: ConvectionDiffusion, eddies: np.ndarray,
+                  modes: np.ndarray) -> np.ndarray:
+    """Return D (p, q, k + q): z changes by Σ_j b_j D_j u in a step, with u the coordinates of the
+    concentration in the basis (n, k) of the mean flow's response and in ``modes`` B (n, q).
+
+    ``eddies`` (n, p) are stream functions ψ_j in m²/s. D_j = −τ Bᵀ M F_½ M⁻¹ N_j F_½ (basis, B) is
+    the midpoint rule for the derivative of a step τ, with N_j c = ∫φ v_j·∇c, v_j = (∂ψ_j/∂y,
+    −∂ψ_j/∂x) and F_½ half a step in the mean flow, which convects eddies and concentration alike.
+    """
+    mesh = transport.mesh
+    half = ConvectionDiffusion(mesh, transport.velocity, transport.diffusivity,
+                               0.5 * transport.time_step, substeps=transport.substeps // 2,
+                               inlet=transport.inlet)
+    F, _ = half.transition()
+    columns = np.hstack([steady_response(transport).basis, modes])
+    entering = columns[transport.inlet]
+    M = mass_matrix(mesh).tocsc()
+    corners = mesh.points[mesh.cells]
+    x, y = np.moveaxis(np.roll(corners, 1, axis=1) - np.roll(corners, -1, axis=1), 2, 0)
+    twice = x[:, 0] * y[:, 1] - y[:, 0] * x[:, 1]                           # signed areas
+    slopes = np.stack([-y, x], axis=1) / twice[:, None, None]               # of hat functions
+    after = splu(M).solve(F.T @ (M @ modes))
+    loads = after[mesh.cells].sum(axis=1).T * np.abs(twice) / 6.0           # (q, cells)
+    before = half.step(columns, entering, entering)
+    by_x, by_y = np.moveaxis(slopes @ before[mesh.cells], 1, 0)             # (cells, k + q)
+    psi_x, psi_y = np.moveaxis(slopes @ eddies[mesh.cells], 1, 0)           # (cells, p)
+    return -transport.time_step * np.array([
+        loads @ (v[:, None] * by_x - w[:, None] * by_y)
+        for v, w in zip(psi_y.T, psi_x.T, strict=True)])
+
+
+@lru_cache(maxsize=1)
+def fitted_model(transport: ConvectionDiffusion) -> tuple[dict[str, np.ndarray], np.ndarray]:
+    """Return the arrays that `studies/turbulence.py` writes, and `eddy_products`."""
+    with np.load(MODEL) as file:
+        arrays = {name: file[name].astype(float) for name in file}
+    return arrays, eddy_products(transport, arrays["eddies"], arrays["modes"])
+
+
+class EddyWindow(InflowWindow):
+    """Inflow window x, error z (q,) and coefficients b (p,): c = c(x) + c_ref B z,
+    z⁺ = A z + Σ_j b_j⁺ D_j u(x, z) + w, b⁺ = A_b b + w_b."""
 
     def __init__(self, task: Task, prior, c_ref: float) -> None:
         super().__init__(task, prior, c_ref)
-        with np.load(MODEL) as model:
-            self.modes, step, noise, self.errors = (model[name].astype(float) for name in (
-                "modes", "transition", "noise", "initial"))
+        self.model, self.products = fitted_model(task.transport)
+        self.modes = self.model["modes"]
         weights, variances = self.ar_model
         self.n = weights.size
-        shift = np.eye(self.n, k=-weights.shape[1])
-        shift[:weights.shape[1]] = np.hstack([np.diag(each) for each in weights])
-        self.transition = block_diag(shift, step)
-        self.noise = block_diag(np.diag(np.pad(variances, (0, self.n - len(variances)))), noise)
+        self.errors = slice(self.n, self.n + self.modes.shape[1])
+        self.shift = np.eye(self.n, k=-weights.shape[1])
+        self.shift[:weights.shape[1]] = np.hstack([np.diag(each) for each in weights])
+        self.noise = np.diag(np.pad(variances, (0, self.n - len(variances))))
 
     def initial(self):
-        covariance = block_diag(super().initial()[1].array, self.errors)
+        covariance = block_diag(super().initial()[1].array, self.model["initial"],
+                                self.model["eddy_initial"])
         return np.zeros(len(covariance)), DenseCovariance(covariance)
 
     def propagate(self, mean, covariance, time: int):
-        P = self.transition @ covariance.array @ self.transition.T + self.noise
-        return self.transition @ mean, DenseCovariance(P)
+        n, errors, A_b = self.n, self.errors, self.model["eddy_transition"]
+        x, z, b = np.split(mean, [n, errors.stop])
+        P, Q_b = covariance.array, self.model["eddy_noise"]
+        b = A_b @ b
+        coordinates = np.concatenate([self.response_coordinates(x), z])
+        by_b = (self.products @ coordinates).T
+        by_u = np.tensordot(b, self.products, 1)
+        u_by_x = block_diag(self.coordinate_derivatives(x), np.eye(len(z)))
+        F = block_diag(self.shift, self.model["transition"], A_b)
+        F[errors, :errors.stop] += by_u @ u_by_x
+        F[errors, errors.stop:] = by_b @ A_b
+        noise = block_diag(self.noise, NOISE_FACTOR * self.model["noise"] + by_b @ Q_b @ by_b.T,
+                           Q_b)
+        noise[errors, errors.stop:] = by_b @ Q_b
+        noise[errors.stop:, errors] = noise[errors, errors.stop:].T
+        # the mean of a product of two unknowns includes their covariance
+        together = u_by_x @ P[:errors.stop, errors.stop:] @ A_b.T
+        z = self.model["transition"] @ z + by_b @ b + np.einsum(
+            "jqu,uj->q", self.products, together, optimize=True)
+        return np.concatenate([self.shift @ x, z, b]), DenseCovariance(F @ P @ F.T + noise)
+
+    def response_coordinates(self, x):
+        """Return c(x)/c_ref − 1 in the basis of the response."""
+        weights = self.response().weights
+        deviation = self.prior.inverse_link(self._recent(x, 0) @ self.prior.modes.T) - 1.0
+        return np.tensordot(weights, deviation, 2)
+
+    def coordinate_derivatives(self, x):
+        """Return the derivatives (k, W·r) of `response_coordinates` by x."""
+        found = self._by_x(x, self.response().weights, 0) / self.c_ref
+        return np.pad(found, ((0, 0), (0, self.n - found.shape[1])))
 
     def concentration(self, mean, lag: int = 0):
-        z = mean[self.n:self.n + self.modes.shape[1]]
-        return super().concentration(mean[:self.n]) + self.c_ref * (self.modes @ z)
+        return super().concentration(mean[:self.n]) + self.c_ref * (self.modes @ mean[self.errors])
 
     def jacobian(self, mean, matrix, lag: int = 0):
         return np.hstack([super().jacobian(mean[:self.n], matrix),
@@ -65,7 +140,7 @@ class Estimator(InflowEstimator):
     subtracks = ("filter",)
 
     def start(self, c_ref: float) -> Filter:
-        return Filter(FlowErrorWindow(self.task, self.prior, c_ref),
+        return Filter(EddyWindow(self.task, self.prior, c_ref),
                       linearise_at_prediction(self.task))
 
     @classmethod

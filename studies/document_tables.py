@@ -51,7 +51,7 @@ ASSUMPTIONS = {
     "fixed_lag_smoother": ("as in the task", "white inflow"),
     "fixed_interval_smoother": ("as in the task", "white inflow"),
     "approximation_error_filter": ("as in the task, with its error", "fitted inflow"),
-    "turbulent_filter": ("as in the task, with its error", "fitted inflow, positive"),
+    "turbulent_filter": ("as in the task, and eddies", "fitted inflow, positive"),
     "coloured_extended_kalman_filter": ("as in the task", "fitted inflow"),
     "log_inflow_filter": ("as in the task", "fitted inflow, positive"),
     "inflow_smoother": ("as in the task", "fitted inflow, positive"),

@@ -129,6 +129,11 @@ class FluctuatingTransport(ConvectionDiffusion):
         self._implicit = 2.0 * self.substeps / self.time_step * self._mass - self._explicit
         self._approximate = SparseLU(self._implicit[:, self._free], DROP)
 
+    def stream_function(self, time: float) -> np.ndarray:
+        """Return the stream function (n,) of the fluctuations in m²/s at a time in s."""
+        found: np.ndarray = self._modes @ self._eddies.coefficients(np.array([time]))[:, 0]
+        return found
+
     def at(self, begin: float) -> FluctuatingTransport:
         """Return the transport of the step that begins at this time in s."""
         step = copy.copy(self)
