@@ -211,8 +211,9 @@ def test_nothing_overflows(folder, tmp_path):
 @pytest.mark.parametrize(("flags", "first"), [((), 0), ((STILL,), 1)], ids=["moving", "still"])
 def test_the_picture_can_be_stopped(flags, first, tmp_path):
     """A button pauses the animation; it is paused if the system prefers reduced motion."""
-    records = [record(name, [error] * 2, official=True, version="v1") for name, error in (
-        ("homogeneous", 0.02), ("gauss_newton", 0.037), ("extended_kalman_filter", 0.004))]
+    records = [record(name, [error] * 2, id=id, official=True, version="v1")
+               for id in ("eitbench/Pipe2D-v0", "eitbench/RotatingTank2D-v0") for name, error in (
+                   ("homogeneous", 0.02), ("gauss_newton", 0.037), ("extended_kalman_filter", 0.004))]
     (tmp_path / "media").mkdir()
     for name in HEADLINE:
         Image.new("RGB", (72, 60), "teal").save(tmp_path / name)
