@@ -22,7 +22,7 @@ from eitbench.estimation import (
 )
 from eitbench.estimation.inflow_response import steady_response
 from eitbench.numerics.fem import mass_matrix
-from eitbench.physics.transport import ConvectionDiffusion
+from eitbench.physics.transport import ConvectionDiffusion, supg_basis
 
 MODEL = Path(__file__).parent / "models" / "turbulent" / "pipe2dturbulent.npz"
 NOISE_FACTOR = 2.0
@@ -46,18 +46,15 @@ def eddy_products(transport: ConvectionDiffusion, eddies: np.ndarray,
     columns = np.hstack([steady_response(transport).basis, modes])
     entering = columns[transport.inlet]
     M = mass_matrix(mesh).tocsc()
-    corners = mesh.points[mesh.cells]
-    x, y = np.moveaxis(np.roll(corners, 1, axis=1) - np.roll(corners, -1, axis=1), 2, 0)
-    twice = x[:, 0] * y[:, 1] - y[:, 0] * x[:, 1]                           # signed areas
-    slopes = np.stack([-y, x], axis=1) / twice[:, None, None]               # of hat functions
+    cells = supg_basis(mesh)
+    nodes = cells.element_dofs                                              # (3, cells)
+    slopes = np.array([phi[0].grad[..., 0] for phi in cells.basis])         # (3, 2, cells)
     after = splu(M).solve(F.T @ (M @ modes))
-    loads = after[mesh.cells].sum(axis=1).T * np.abs(twice) / 6.0           # (q, cells)
-    before = half.step(columns, entering, entering)
-    by_x, by_y = np.moveaxis(slopes @ before[mesh.cells], 1, 0)             # (cells, k + q)
-    psi_x, psi_y = np.moveaxis(slopes @ eddies[mesh.cells], 1, 0)           # (cells, p)
+    loads = after[nodes].sum(axis=0).T * cells.dx.sum(axis=1) / 3.0         # (q, cells)
+    by_x, by_y = np.einsum("idc,ick->dck", slopes, half.step(columns, entering, entering)[nodes])
+    psi_x, psi_y = np.einsum("idc,icp->dpc", slopes, eddies[nodes])
     return -transport.time_step * np.array([
-        loads @ (v[:, None] * by_x - w[:, None] * by_y)
-        for v, w in zip(psi_y.T, psi_x.T, strict=True)])
+        loads @ (v[:, None] * by_x - w[:, None] * by_y) for v, w in zip(psi_y, psi_x, strict=True)])
 
 
 @lru_cache(maxsize=1)
@@ -89,37 +86,22 @@ class EddyWindow(InflowWindow):
         return np.zeros(len(covariance)), DenseCovariance(covariance)
 
     def propagate(self, mean, covariance, time: int):
-        n, errors, A_b = self.n, self.errors, self.model["eddy_transition"]
-        x, z, b = np.split(mean, [n, errors.stop])
-        P, Q_b = covariance.array, self.model["eddy_noise"]
-        b = A_b @ b
-        coordinates = np.concatenate([self.response_coordinates(x), z])
-        by_b = (self.products @ coordinates).T
-        by_u = np.tensordot(b, self.products, 1)
-        u_by_x = block_diag(self.coordinate_derivatives(x), np.eye(len(z)))
-        F = block_diag(self.shift, self.model["transition"], A_b)
-        F[errors, :errors.stop] += by_u @ u_by_x
-        F[errors, errors.stop:] = by_b @ A_b
-        noise = block_diag(self.noise, NOISE_FACTOR * self.model["noise"] + by_b @ Q_b @ by_b.T,
-                           Q_b)
-        noise[errors, errors.stop:] = by_b @ Q_b
-        noise[errors.stop:, errors] = noise[errors, errors.stop:].T
+        end, A, A_b = self.errors.stop, self.model["transition"], self.model["eddy_transition"]
+        x, z, b = np.split(mean, [self.n, end])
+        P, b = covariance.array, A_b @ b
+        basis = self.response().basis                                       # orthonormal
+        y = basis.T @ (super().concentration(x) / self.c_ref - 1.0)
+        u_by_state = block_diag(super().jacobian(x, basis.T) / self.c_ref, np.eye(len(z)))
+        z_by_b = (self.products @ np.concatenate([y, z])).T
+        by_b = np.vstack([np.zeros((self.n, len(b))), z_by_b, np.eye(len(b))])
+        F = np.hstack([block_diag(self.shift, A, np.zeros((len(b), 0))), by_b @ A_b])
+        F[self.errors, :end] += np.tensordot(b, self.products, 1) @ u_by_state
+        noise = block_diag(self.noise, NOISE_FACTOR * self.model["noise"], np.zeros(A_b.shape))
+        noise += by_b @ self.model["eddy_noise"] @ by_b.T
         # the mean of a product of two unknowns includes their covariance
-        together = u_by_x @ P[:errors.stop, errors.stop:] @ A_b.T
-        z = self.model["transition"] @ z + by_b @ b + np.einsum(
-            "jqu,uj->q", self.products, together, optimize=True)
+        together = u_by_state @ P[:end, end:] @ A_b.T
+        z = A @ z + z_by_b @ b + np.einsum("jqu,uj->q", self.products, together, optimize=True)
         return np.concatenate([self.shift @ x, z, b]), DenseCovariance(F @ P @ F.T + noise)
-
-    def response_coordinates(self, x):
-        """Return c(x)/c_ref − 1 in the basis of the response."""
-        weights = self.response().weights
-        deviation = self.prior.inverse_link(self._recent(x, 0) @ self.prior.modes.T) - 1.0
-        return np.tensordot(weights, deviation, 2)
-
-    def coordinate_derivatives(self, x):
-        """Return the derivatives (k, W·r) of `response_coordinates` by x."""
-        found = self._by_x(x, self.response().weights, 0) / self.c_ref
-        return np.pad(found, ((0, 0), (0, self.n - found.shape[1])))
 
     def concentration(self, mean, lag: int = 0):
         return super().concentration(mean[:self.n]) + self.c_ref * (self.modes @ mean[self.errors])

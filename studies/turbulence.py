@@ -33,15 +33,14 @@ def training_episode(world, model, seed: int) -> tuple[np.ndarray, ...]:
     """Return stream function in the middle of the step to t in m²/s, error d of the mean flow, and
     the mean flow's c/background − 1, (T + 1, n) each, t = 0 … T."""
     transport_at = world.flow.true_transport(world, model, episode_streams(seed).flow)
-    eddies = transport_at(0)
     true = mean = np.full(model.transport.mesh.n_nodes, world.background)
     found = []
     for t, ends in enumerate(pairwise(world.sample_inflow(seed)), 1 - world.spin_up_steps):
         true, mean = transport_at(t).step(true, *ends), model.transport.step(mean, *ends)
-        found.append((eddies.stream_function((t - 0.5) * world.time_step),
-                      (true - mean) / world.background, mean / world.background - 1.0))
-    return tuple(np.array(each, np.float32) for each in zip(*found[world.spin_up_steps - 1:],
-                                                            strict=True))
+        found.append(((true - mean) / world.background, mean / world.background - 1.0))
+    errors, means = np.array(found[world.spin_up_steps - 1:], np.float32).swapaxes(0, 1)
+    middles = (np.arange(len(errors)) - 0.5) * world.time_step
+    return transport_at(0).stream_function(middles).T.astype(np.float32), errors, means
 
 
 def principal_modes(samples: np.ndarray, inner: np.ndarray, count: int) -> np.ndarray:

@@ -129,10 +129,9 @@ class FluctuatingTransport(ConvectionDiffusion):
         self._implicit = 2.0 * self.substeps / self.time_step * self._mass - self._explicit
         self._approximate = SparseLU(self._implicit[:, self._free], DROP)
 
-    def stream_function(self, time: float) -> np.ndarray:
-        """Return the stream function (n,) of the fluctuations in m²/s at a time in s."""
-        found: np.ndarray = self._modes @ self._eddies.coefficients(np.array([time]))[:, 0]
-        return found
+    def stream_function(self, times: np.ndarray) -> np.ndarray:
+        """Return the stream function (n, T) of the fluctuations in m²/s at times (T,) in s."""
+        return self._modes @ self._eddies.coefficients(times)
 
     def at(self, begin: float) -> FluctuatingTransport:
         """Return the transport of the step that begins at this time in s."""
@@ -151,8 +150,7 @@ class FluctuatingTransport(ConvectionDiffusion):
         load = 0.0 if source is None else self._mass @ source
         # backward Euler to the ends of two half sub-steps; then Crank–Nicolson about the middles
         times = dt * np.concatenate([[0.5, 1.0], np.arange(1.5, self.substeps)])
-        by_x, by_y = np.split(self._gradient @ (
-            self._modes @ self._eddies.coefficients(self.begin + times)), 2)
+        by_x, by_y = np.split(self._gradient @ self.stream_function(self.begin + times), 2)
         velocity = np.concatenate([by_y, -by_x]).T.copy()                  # (solves, 2 cells)
         c = c.copy()
         c[self.inlet] = before
