@@ -56,6 +56,7 @@ class CrossCorrelationFilter:
         zero = np.zeros_like(flow.initial)
         exact = replace(flow, initial_std=zero, walk_std=zero)
         self._filter = Filter(VelocityStates(task, c_ref, exact), linearise_at_prediction(task))
+        self.covariance_of = self._filter.covariance_of
 
     def assimilate(self, voltages: np.ndarray, currents: np.ndarray) -> None:
         """Use a measurement vector (L,) in V and its injection (L,) in A (A/m in 2D)."""

@@ -33,23 +33,38 @@ class Estimator(InflowEstimator):
         return task.mesh.dim == 2 and super().suits(task)
 
 
+class SmoothedEnsemble:
+    """States of a measurement sequence: inflows x (W, N, r) of the members, the newest first."""
+
+    def __init__(self, space: InflowWindow, x: np.ndarray) -> None:
+        self.space = space
+        self.x = x
+
+    def members(self, lag: int) -> np.ndarray:
+        """Return the concentrations (N, n) in mol/m³ ``lag`` steps before the last."""
+        return self.space.concentration(self.x.swapaxes(0, 1).reshape(MEMBERS, -1), lag)
+
+    def estimate(self, lag: int) -> Estimate:
+        c = self.members(lag)
+        return Estimate(c.mean(axis=0), c.var(axis=0, ddof=1))
+
+    def covariance_of(self, functionals: np.ndarray, lag: int) -> np.ndarray:
+        return np.atleast_2d(np.cov(functionals @ self.members(lag).T))
+
+
 def smooth(task: Task, prior: InflowPrior, c_ref: float,
-           record: Sequence[tuple[np.ndarray, np.ndarray]]) -> list[Estimate]:
-    """Return the states t = 1 … T of a measurement sequence."""
+           record: Sequence[tuple[np.ndarray, np.ndarray]]) -> SmoothedEnsemble:
+    """Return the states of a measurement sequence."""
     random = np.random.default_rng(SEED)
     V, I = (np.array(part) for part in zip(*record, strict=True))
     space = InflowWindow(task, prior, c_ref, len(record))
     before = np.linalg.cholesky(toeplitz(prior.time_covariance(space.window_steps)))
     x = np.tensordot(before, random.standard_normal((len(before), MEMBERS, space.n_modes)), 1)
-
-    def states(t: int) -> np.ndarray:
-        """Return the concentrations (N, n) at t; the newest inflow of x (W, N, r) enters at T."""
-        members = x.swapaxes(0, 1).reshape(MEMBERS, -1)
-        return space.concentration(members, len(record) - t)
-
+    states = SmoothedEnsemble(space, x)
     for _ in range(PASSES):
-        computed = np.array([task.observation.transfer_resistance(states(t)) @ I[t - 1]
-                             for t in range(1, len(record) + 1)])                    # (T, N, L)
+        computed = np.array([
+            task.observation.transfer_resistance(states.members(len(I) - t)) @ I[t - 1]
+            for t in range(1, len(I) + 1)])                                          # (T, N, L)
         std = task.noise.std(computed.mean(axis=1))[:, None]
         noise = PASSES**0.5 * random.standard_normal(computed.shape)
         residual = np.nan_to_num((V[:, None] - computed) / std + noise)    # NaN: not measured
@@ -61,5 +76,4 @@ def smooth(task: Task, prior: InflowPrior, c_ref: float,
             gain = np.linalg.solve(A.T @ A + PASSES * np.eye(MEMBERS), A.T @ d)      # (N, N)
             deviation = (x[k] - x[k].mean(axis=0)) / (MEMBERS - 1)**0.5
             x[k] += gain.T @ deviation
-    ensembles = (states(t) for t in range(1, len(record) + 1))
-    return [Estimate(c.mean(axis=0), c.var(axis=0, ddof=1)) for c in ensembles]
+    return states

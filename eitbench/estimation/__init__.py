@@ -6,6 +6,7 @@ from eitbench.estimation.correction import (
     NetworkCorrectedFilter,
     VoltageFeatures,
     apply_correction,
+    correction_covariance,
     gru_step,
     initial_hidden_state,
     load_network,
