@@ -16,7 +16,7 @@ before it."""
 TOP = 433
 """Lines allowed in the other modules at the top: public names, argument checks, files, messages."""
 BASELINES = 2323
-TESTS = 19_899
+TESTS = 19_903
 MODULES = {".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__"): path
            for path in PACKAGE.rglob("*.py")}
 
