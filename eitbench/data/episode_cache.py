@@ -22,6 +22,7 @@ from eitbench.data import cache
 from eitbench.data.episodes import (
     Episode,
     cache_per_truth,
+    n_solutions,
     simulate,
     simulate_batch,
 )
@@ -93,10 +94,12 @@ def cached_episode(world: World, seed: int) -> np.ndarray:
 
 
 def cached_episode_prefix(world: World, seed: int, needed: int) -> np.ndarray:
-    """Return the entries of the whole episode if it is cached; otherwise of its first steps,
-    ``needed`` or more, which are shipped or simulated in a quarter of the time."""
+    """Return the entries of the whole episode if it is cached, or if its first steps, ``needed`` or
+    more, take more than half of its time; otherwise those of the first steps, shipped or simulated.
+    """
     last = needed + EXTRA_STEPS
-    if last >= world.n_steps or is_episode_cached(world, seed):
+    is_short = 2 * n_solutions(world, last) > n_solutions(world, world.n_steps)
+    if is_short or is_episode_cached(world, seed):
         return cached_episode(world, seed)
     entries = _shipped(world.truth_config) if seed == BUNDLED_SEED else None
     if entries is None or len(entries) < needed:

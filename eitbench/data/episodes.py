@@ -66,6 +66,12 @@ def cached_truth_model(world: World) -> Discretisation:
     return world.truth_model()
 
 
+def n_solutions(world: World, steps: int) -> int:
+    """Return the number of linear systems that are solved for an episode up to the state ``steps``:
+    one for each time step since the spin-up began, one for the potential of each state."""
+    return world.spin_up_steps + 2 * steps
+
+
 def simulate_batch(world: World, seeds: Sequence[int], progress: bool = True,
                    last: int | None = None) -> Iterator[Episode]:
     """Simulate several seeds up to the state ``last`` (default: all), bit-identical to `simulate`;
@@ -75,7 +81,7 @@ def simulate_batch(world: World, seeds: Sequence[int], progress: bool = True,
     electrodes = truth.observation.cem.n_electrodes
     spread = world.instrument.contact_impedance_spread
     steps = world.n_steps if last is None else last
-    total = (world.spin_up_steps + 2 * steps) * len(seeds)
+    total = n_solutions(world, steps) * len(seeds)
     wait = SlowTaskNotice(label, total, PRESIMULATE_HINT)
     with tqdm(total=total, desc=label, unit="step", leave=False,
               disable=None if progress else True) as bar:

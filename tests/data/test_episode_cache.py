@@ -136,10 +136,10 @@ def test_cached_episodes_need_no_finite_elements(episode):
     assert done.stdout == "True []\n"
 
 
-LONGER = {id: merged(changes, {"schedule": {"scored_steps": 14}}) for id, changes in {
+LONGER = {id: merged(changes, {"schedule": {"scored_steps": 32}}) for id, changes in {
     "eitbench/Pipe2DFixedLag-v0": FAST, "eitbench/Pipe2DInjectionFlow-v0": WANDERING,
     "eitbench/StationaryTank2D-v0": {}}.items()}
-"""Changes to worlds of some 16 steps."""
+"""Changes to worlds of some 34 steps; more than half the time of a shorter episode is in its first steps."""
 
 
 @pytest.mark.parametrize("id", LONGER)
