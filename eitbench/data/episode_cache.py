@@ -94,8 +94,8 @@ def cached_episode(world: World, seed: int) -> np.ndarray:
 
 
 def cached_episode_prefix(world: World, seed: int, needed: int) -> np.ndarray:
-    """Return the entries of the first steps of an episode, ``needed`` or more, shipped or simulated;
-    of the whole episode if it is cached, or if the first steps take more than half of its time."""
+    """Return the entries of an episode's first steps, ``needed`` or more, shipped or simulated; of
+    the whole episode if it is cached, or if the first steps take more than half of its time."""
     last = needed + EXTRA_STEPS
     is_short = 2 * n_solutions(world, last) > n_solutions(world, world.n_steps)
     if is_short or is_episode_cached(world, seed):
