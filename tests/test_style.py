@@ -15,8 +15,8 @@ BUDGETS = {"numerics": 1658, "scoring": 205, "physics": 1716, "worlds": 2782, "d
 before it."""
 TOP = 433
 """Lines allowed in the other modules at the top: public names, argument checks, files, messages."""
-BASELINES = 2323
-TESTS = 19_903
+BASELINES = 2332
+TESTS = 19_904
 MODULES = {".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__"): path
            for path in PACKAGE.rglob("*.py")}
 
