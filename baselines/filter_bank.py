@@ -47,17 +47,9 @@ class FilterBank:
             for step in steps]))
 
     def estimate(self, lag: int = 0) -> Estimate:
-        estimate = self.filters[self.best].estimate()
-        return estimate._replace(velocity=VELOCITY_FACTORS[self.best] * self.nominal)
-
-    def covariance_of(self, functionals: np.ndarray, lag: int = 0) -> np.ndarray | None:
-        """Return the covariance (m, m) of functionals (m, n), from the filter that fits best."""
-        return self.filters[self.best].covariance_of(functionals)
-
-    @property
-    def best(self) -> int:
-        """Number of the filter that fits best."""
-        return int(np.sum(self.misfits[-WINDOW:], axis=0).argmin())
+        best = int(np.sum(self.misfits[-WINDOW:], axis=0).argmin())
+        estimate = self.filters[best].estimate()
+        return estimate._replace(velocity=VELOCITY_FACTORS[best] * self.nominal)
 
 
 @lru_cache(maxsize=2)

@@ -8,7 +8,6 @@ contains.
 """
 
 from collections.abc import Iterator
-from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -18,32 +17,12 @@ from eitbench.estimation import (
     InflowEstimator,
     RecordSmoother,
     apply_correction,
-    correction_covariance,
     gru_step,
     initial_hidden_state,
 )
 
 LAG = 20
 """Time steps after which measurements hardly change the estimate of a state."""
-
-
-class CorrectedStates(NamedTuple):
-    """Corrected states of a measurement sequence, from rows for each time step."""
-
-    network: Any
-    c_ref: float
-    reduced: np.ndarray
-    inputs: np.ndarray
-    hidden_states: np.ndarray
-
-    def estimate(self, lag: int) -> Estimate:
-        t = -1 - lag
-        return apply_correction(self.network, self.c_ref, self.reduced[t], self.inputs[t],
-                                self.hidden_states[t])
-
-    def covariance_of(self, functionals: np.ndarray, lag: int) -> np.ndarray:
-        return correction_covariance(self.network, self.c_ref, self.hidden_states[-1 - lag],
-                                     functionals)
 
 
 class Estimator(InflowEstimator):
@@ -58,7 +37,7 @@ class Estimator(InflowEstimator):
     def start(self, c_ref: float) -> RecordSmoother:
         return RecordSmoother(lambda record: self.corrected(c_ref, record))
 
-    def corrected(self, c_ref: float, record) -> CorrectedStates:
+    def corrected(self, c_ref: float, record) -> list[Estimate]:
         """Return the corrected states of a whole measurement sequence."""
         features = FilterFeatures(self.task, self.prior, c_ref, self.network["basis"], LAG)
         seen, (reduced,) = features.record(record, LAG)
@@ -66,7 +45,8 @@ class Estimator(InflowEstimator):
         forward = list(self.hidden_states(inputs, ""))
         backward = list(self.hidden_states(inputs[::-1], "backward_"))
         hidden_states = np.concatenate([forward, backward[::-1]], axis=1)
-        return CorrectedStates(self.network, c_ref, reduced, inputs, hidden_states)
+        return [apply_correction(self.network, c_ref, *each)
+                for each in zip(reduced, inputs, hidden_states, strict=True)]
 
     def hidden_states(self, inputs: np.ndarray, direction: str) -> Iterator[np.ndarray]:
         """Yield the hidden state (h,) of each step."""

@@ -69,32 +69,15 @@ def apply_correction(network: Network, c_ref: float, reduced: np.ndarray, inputs
     Δ is a linear map of the hidden state (of both directions), plus linear maps of the inputs (d,)
     with weights from the hidden state.
     """
-    linear, variance = _outputs(network, hidden_state)
+    outputs = network["output_weight"] @ hidden_state + network["output_bias"]
+    linear, log_variance = np.split(outputs, 2)
     mixing = network["mixing_weight"] @ hidden_state + network["mixing_bias"]
     scale = network["output_scale"]
     correction = scale * (linear + mixing @ (network["maps"] @ (inputs / network["input_scale"])))
     basis = network["basis"]
     mean = 1.0 + basis @ (reduced + correction)
-    return Estimate(c_ref * mean, c_ref**2 * (basis**2 @ variance + network["rest"]))
-
-
-def correction_covariance(network: Network, c_ref: float, hidden_state: np.ndarray,
-                          functionals: np.ndarray) -> np.ndarray:
-    """Return the covariance (m, m) of ``functionals`` (m, n) after `apply_correction`: errors of
-    the modes are independent of each other, the rest is independent between nodes."""
-    by_mode = functionals @ network["basis"]
-    variance = _outputs(network, hidden_state)[1]
-    covariance: np.ndarray = ((by_mode * variance) @ by_mode.T
-                              + (functionals * network["rest"]) @ functionals.T)
-    return c_ref**2 * covariance
-
-
-def _outputs(network: Network, hidden_state: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the part of Δ that is linear in the hidden state, unscaled, and the variances of the
-    modes, (q,) each."""
-    outputs = network["output_weight"] @ hidden_state + network["output_bias"]
-    linear, log_variance = np.split(outputs, 2)
-    return linear, network["output_scale"]**2 * np.exp(log_variance)
+    variance = basis**2 @ (scale**2 * np.exp(log_variance)) + network["rest"]
+    return Estimate(c_ref * mean, c_ref**2 * variance)
 
 
 def _sigmoid(x: np.ndarray) -> np.ndarray:
@@ -222,15 +205,6 @@ class NetworkCorrectedFilter:
             assert isinstance(self.features, FilterFeatures)
             return self.features.filter.estimate(lag)
         return apply_correction(self.network, self.features.c_ref, *self._last, self._hidden_state)
-
-    def covariance_of(self, functionals: np.ndarray, lag: int = 0) -> np.ndarray | None:
-        """Return the covariance (m, m) of ``functionals`` (m, n) of the concentration ``lag`` steps
-        ago."""
-        if lag < self.lag:
-            assert isinstance(self.features, FilterFeatures)
-            return self.features.filter.covariance_of(functionals, lag)
-        return correction_covariance(self.network, self.features.c_ref, self._hidden_state,
-                                     functionals)
 
 
 def injection_one_hot(task: Task, currents: np.ndarray) -> np.ndarray:
