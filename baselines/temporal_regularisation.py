@@ -31,6 +31,8 @@ class Window:
         self.projected: dict[bytes, np.ndarray] = {}
         self.rows: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
         """of each measurement, divided by its std: H, H Γ, residual at ĉ_bh"""
+        self.reduction = np.empty((0, len(self.start)))
+        """B, with Γ − Bᵀ B the covariance of the state that `estimate` returned last"""
 
     def assimilate(self, voltages: np.ndarray, currents: np.ndarray) -> None:
         """Store a measurement vector."""
@@ -45,16 +47,6 @@ class Window:
 
     def estimate(self, lag: int = 0) -> Estimate:
         """Return the state ``lag`` steps before the last from the window around it."""
-        mean, reduction = self._condition(lag)
-        return Estimate(mean, self.covariance.diagonal() - (reduction**2).sum(axis=0))
-
-    def covariance_of(self, functionals: np.ndarray, lag: int = 0) -> np.ndarray:
-        """Return the covariance (m, m) of functionals (m, n) of this state."""
-        reduction = self._condition(lag)[1] @ functionals.T
-        return functionals @ self.covariance @ functionals.T - reduction.T @ reduction
-
-    def _condition(self, lag: int) -> tuple[np.ndarray, np.ndarray]:
-        """Return the mean (n,) of this state, and B (m, n), with Γ − Bᵀ B its covariance."""
         time = len(self.rows) - 1 - lag
         first = max(0, time - WINDOW + 1)
         window = self.rows[first:time + WINDOW]
@@ -64,7 +56,14 @@ class Window:
         cross = GAMMA**np.abs(at - time)[:, None] * G
         factor = cho_factor(S, lower=True)
         mean = self.start + cho_solve(factor, residual) @ cross
-        return mean, solve_triangular(factor[0], cross, lower=True)
+        self.reduction = solve_triangular(factor[0], cross, lower=True)
+        return Estimate(mean, self.covariance.diagonal() - (self.reduction**2).sum(axis=0))
+
+    def covariance_of(self, functionals: np.ndarray, lag: int = 0) -> np.ndarray:
+        """Return the covariance (m, m) of functionals (m, n) of the state `estimate` returned last.
+        """
+        reduction = self.reduction @ functionals.T
+        return functionals @ self.covariance @ functionals.T - reduction.T @ reduction
 
 
 class Estimator(FilterEstimator):
