@@ -15,7 +15,7 @@ BUDGETS = {"numerics": 1658, "scoring": 205, "physics": 1716, "worlds": 2782, "d
 before it."""
 TOP = 433
 """Lines allowed in the other modules at the top: public names, argument checks, files, messages."""
-BASELINES = 2304
+BASELINES = 2303
 TESTS = 19_902
 MODULES = {".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__"): path
            for path in PACKAGE.rglob("*.py")}
