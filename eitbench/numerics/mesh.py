@@ -129,16 +129,13 @@ class Mesh:
         tree, reach = self._cell_tree
         near = tree.query(points, k=k)[1].reshape(len(points), k)
         best, weights = self._best_cell(points, near)
-        lost = np.flatnonzero(weights.min(axis=1) < -1e-9)
-        if lost.size and k < len(self.cells):
+        for lost in _parts(weights.min(axis=1) < -1e-9):
             around = tree.query_ball_point(points[lost], (1.0 + 1e-9) * reach, return_sorted=True)
-            for i, cells in zip(lost, around, strict=True):
-                if cells:
-                    only = slice(i, i + 1)
-                    best[only], weights[only] = self._best_cell(points[only], np.array([cells]))
-        for i in np.flatnonzero(weights.min(axis=1) < -1e-9):
+            cells = [found or [old] for found, old in zip(around, best[lost], strict=True)]
+            best[lost], weights[lost] = self._best_cell(points[lost], _rectangular(cells))
+        for lost in _parts(weights.min(axis=1) < -1e-9):
             # The cell with the least negative coordinate may be a large one far inside.
-            best[i], weights[i] = self._nearest_wall(points[i])
+            best[lost], weights[lost] = self._nearest_wall(points[lost])
         weights = np.clip(weights, 0.0, None)
         weights /= weights.sum(axis=1, keepdims=True)
         return best, weights
@@ -155,34 +152,55 @@ class Mesh:
         matrix.eliminate_zeros()
         return matrix
 
-    def _nearest_wall(self, point: np.ndarray) -> tuple[int, np.ndarray]:
-        """Return the cell of the nearest boundary facet, and coordinates of the projection."""
+    def _nearest_wall(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the cells of the nearest boundary facets, and coordinates of the projections."""
         tree, reach = self._wall_tree
-        wall = self.points[np.unique(self.boundary_facets)]
-        distance = np.sqrt(((wall - point)**2).sum(axis=1).min())
-        near = tree.query_ball_point(point, (1.0 + 1e-9) * (distance + reach), return_sorted=True)
+        distance = cKDTree(self.points[np.unique(self.boundary_facets)]).query(points)[0]
+        near = _rectangular(tree.query_ball_point(points, (1.0 + 1e-9) * (distance + reach),
+                                                  return_sorted=True))
         facets, cells = (array[near] for array in self._boundary)
-        corner = self.points[facets]                                                   # (f, d, d)
-        edges = corner[:, 1:] - corner[:, :1]
-        gram = edges @ np.swapaxes(edges, 1, 2)
-        local = np.linalg.solve(gram, edges @ (point - corner[:, 0])[:, :, None])[..., 0]
-        weights = np.concatenate([1.0 - local.sum(axis=1, keepdims=True), local], axis=1)
+        corner = self.points[facets]                                                # (k, f, d, d)
+        edges = corner[:, :, 1:] - corner[:, :, :1]
+        gram = edges @ np.swapaxes(edges, 2, 3)
+        local = np.linalg.solve(gram, edges @ (points[:, None] - corner[:, :, 0])[..., None])[..., 0]
+        weights = np.concatenate([1.0 - local.sum(axis=2, keepdims=True), local], axis=2)
         weights = np.clip(weights, 0.0, None)
-        weights /= weights.sum(axis=1, keepdims=True)
-        nearest = np.linalg.norm(np.einsum("fi,fid->fd", weights, corner) - point, axis=1).argmin()
-        same_node = self.cells[cells[nearest]][:, None] == facets[nearest]              # (d + 1, d)
-        return int(cells[nearest]), same_node @ weights[nearest]
+        weights /= weights.sum(axis=2, keepdims=True)
+        moved = np.einsum("kfi,kfid->kfd", weights, corner)
+        nearest = np.linalg.norm(moved - points[:, None], axis=2).argmin(axis=1)
+        row = np.arange(len(points))
+        best = cells[row, nearest]
+        same_node = self.cells[best][:, :, None] == facets[row, nearest][:, None]   # (k, d + 1, d)
+        return best, (same_node @ weights[row, nearest][:, :, None])[..., 0]
+
+    @cached_property
+    def _gradients(self) -> np.ndarray:
+        """(n_cells, d + 1, d) gradients of the barycentric coordinates."""
+        corner = self.points[self.cells]
+        others = np.linalg.inv(np.swapaxes(corner[:, 1:] - corner[:, :1], 1, 2))
+        return np.concatenate([-others.sum(axis=1, keepdims=True), others], axis=1)
 
     def _best_cell(self, points: np.ndarray,
                    candidates: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the best cell among each point's candidates, and barycentric coordinates."""
-        corner = self.points[self.cells[candidates]]  # (k, c, d+1, d)
-        edges = np.swapaxes(corner[:, :, 1:] - corner[:, :, :1], 2, 3)
-        local = np.linalg.solve(edges, (points[:, None] - corner[:, :, 0])[..., None])[..., 0]
-        barycentric = np.concatenate([1.0 - local.sum(axis=2, keepdims=True), local], axis=2)
+        from_corner = points[:, None] - self.points[self.cells[candidates, 0]]          # (k, c, d)
+        barycentric = np.einsum("kcij,kcj->kci", self._gradients[candidates], from_corner)
+        barycentric[:, :, 0] += 1.0
         which = barycentric.min(axis=2).argmax(axis=1)
         row = np.arange(len(points))
         return candidates[row, which], barycentric[row, which]
+
+
+def _parts(chosen: np.ndarray, size: int = 1000) -> list[np.ndarray]:
+    """Return the numbers of the chosen points, in parts that limit the memory."""
+    numbers = np.flatnonzero(chosen)
+    return [numbers[begin:begin + size] for begin in range(0, len(numbers), size)]
+
+
+def _rectangular(rows: Sequence[list[int]] | np.ndarray) -> np.ndarray:
+    """Return lists of numbers as one array; shorter ones repeat their first number."""
+    width = max(map(len, rows))
+    return np.array([row + row[:1] * (width - len(row)) for row in rows])
 
 
 def _tree(corner: np.ndarray) -> tuple[cKDTree, float]:

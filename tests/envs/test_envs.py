@@ -18,7 +18,7 @@ from gymnasium.utils.env_checker import check_env
 from stable_baselines3.common.env_checker import check_env as check_env_sb3
 
 import injection_envs
-from injection_envs import BUDGET, CURRENTS, FLOW, INJECTION, NAME, arrays_of, play, some_actions
+from injection_envs import BUDGET, CURRENTS, FAULTS, FLOW, INJECTION, NAME, TANK, arrays_of, play, some_actions
 from short import SHORT, short
 
 POLICIES = [*((id, "reduced", "raw") for id in INJECTION), (NAME, "reduced", "scaled"), (BUDGET, "reduced", "scaled"),
@@ -33,20 +33,25 @@ def test_every_id_has_a_short_version():
         assert any(changes is each for each in used)
 
 
-@pytest.mark.parametrize("id", ESTIMATION)
+def unless_slow(ids, fast):
+    """Mark ids that are not in ``fast`` as slow: spaces and classes are the same, only numbers differ."""
+    return [pytest.param(id, marks=() if id in fast else pytest.mark.slow) for id in ids]
+
+
+@pytest.mark.parametrize("id", unless_slow(ESTIMATION, KINDS))
 @pytest.mark.filterwarnings("ignore:We recommend you to use a symmetric and normalized Box action space")
 def test_checkers_pass(id):
     """Spaces, seeding, returned types and rendering meet the requirements of gymnasium and stable-baselines3."""
-    check_env(make(id, render_mode="rgb_array").unwrapped, skip_render_check=id not in KINDS)
-    check_env_sb3(make(id).unwrapped)
+    check_env(make(id, render_mode="rgb_array", episodes=1).unwrapped, skip_render_check=id not in KINDS)
+    check_env_sb3(make(id, episodes=1).unwrapped)
 
 
-@pytest.mark.parametrize(("id", "kwargs"), [*((id, {}) for id in INJECTION), (NAME, {"observation": "raw"}),
-                                            (NAME, {"observation": "raw", "estimator": "none"})])
+@pytest.mark.parametrize("id", unless_slow(INJECTION, (NAME, CURRENTS, BUDGET, FAULTS, TANK)))
+@pytest.mark.parametrize("kwargs", [{}, {"observation": "raw"}, {"observation": "raw", "estimator": "none"}])
 @pytest.mark.filterwarnings("ignore")
 def test_checkers_pass_for_policies(id, kwargs):
-    check_env(make(id, **kwargs).unwrapped, skip_render_check=True)
-    check_env_sb3(make(id, **kwargs).unwrapped)
+    check_env(make(id, episodes=1, **kwargs).unwrapped, skip_render_check=True)
+    check_env_sb3(make(id, episodes=1, **kwargs).unwrapped)
 
 
 @pytest.mark.parametrize(("id", "estimator", "observation"), [*((id, None, None) for id in KINDS), *POLICIES])

@@ -30,8 +30,8 @@ def test_voltages_are_those_of_the_pair():
     env = make()
     base = env.unwrapped
     actions = some_pairs()
-    entries = cached_episode(base.world, 3)
-    env.reset(seed=3)
+    entries = cached_episode(base.world, 1)
+    env.reset(seed=1)
     assert base.error is None
     for t in range(base.world.n_steps):
         observation, reward, over, *_ = env.step(int(actions[t]))
@@ -63,14 +63,14 @@ def test_reward_is_the_decrease_of_the_error(estimator, name):
     voltages."""
     env = make(estimator, name)
     base = env.unwrapped
-    observation, _ = env.reset(seed=3)
+    observation, _ = env.reset(seed=1)
     played = base.world
-    voltages = cycle_voltages(played, 3, cached_episode(played, 3))
+    voltages = cycle_voltages(played, 1, cached_episode(played, 1))
     np.testing.assert_array_equal(observation["frame"], voltages[:16])
     np.testing.assert_array_equal(observation["voltages"], voltages[15])
     np.testing.assert_array_equal(observation["currents"], played.currents[15])
     mesh, region = played.truth_model().transport.mesh, played.region or (0.0, played.vessel.length)
-    truth = eitbench.simulate(played, 3).concentration.astype(float)
+    truth = eitbench.simulate(played, 1).concentration.astype(float)
     onto = base.task.mesh.interpolation_to(mesh.points)
     level = np.full(onto.shape[1], filter_of(base).c_ref[0])
     paid = 0
@@ -93,7 +93,7 @@ def test_reward_is_the_decrease_of_the_error(estimator, name):
 def test_observations_keep_the_last_steps_or_injections(history):
     """A step without an injection shifts the currents of the last steps, but not the last injections."""
     env = make("reduced", BUDGET, history=history, inflow="learned")
-    first = env.reset(seed=2)[0]
+    first = env.reset(seed=1)[0]
     idle, steps = env.unwrapped.rules.action(None), []
     for action in (30, idle, idle, 70, idle):
         steps.append(env.step(action)[0])
@@ -109,7 +109,7 @@ def test_observations_keep_the_last_steps_or_injections(history):
         np.testing.assert_array_equal(steps[2]["innovations"], steps[0]["innovations"])
         assert (steps[3]["innovations"] != steps[2]["innovations"]).any()
         scaled = make("reduced", BUDGET, observation="scaled", history=history, inflow="learned")
-        assert len(scaled.reset(seed=2)[0]) == 203
+        assert len(scaled.reset(seed=1)[0]) == 203
 
 
 @pytest.mark.parametrize(("name", "estimator", "observation", "n"), [
@@ -118,9 +118,9 @@ def test_observations_keep_the_last_steps_or_injections(history):
 def test_vectorised_as_single(name, estimator, observation, n):
     """Vectorised and single environments are bit-identical, also after an episode's end and with
     threads."""
-    kwargs = {"num_envs": n, "estimator": estimator, "episodes": 3, "observation": observation}
+    kwargs = {"num_envs": n, "estimator": estimator, "episodes": 2, "observation": observation}
     envs = [make_many(name, mode="sync", **kwargs), *(make_many(name, threads=threads, **kwargs) for threads in (1, 2))]
-    seeds = [k % 4 for k in range(n)]
+    seeds = [k % 2 for k in range(n)]
     steps = [[env.reset(seed=seeds)] for env in envs]
     chosen = np.random.default_rng(0)
     for _ in range(26 if estimator == "none" else 9):                 # which has shorter episodes
@@ -158,11 +158,11 @@ def test_an_estimate_that_is_not_finite_is_an_error(monkeypatch):
 
     monkeypatch.setattr(ReducedFilters, "errors", broken)
     env = make("reduced")
-    env.reset(seed=4)
+    env.reset(seed=1)
     unscored = env.unwrapped.world.warm_up - 16
     for _ in range(unscored):
         assert env.step(7)[1] == 0.0
-    with pytest.raises(FloatingPointError, match=rf"state {17 + unscored} is not finite.* \[4\]"):
+    with pytest.raises(FloatingPointError, match=rf"state {17 + unscored} is not finite.* \[1\]"):
         env.step(7)
 
 

@@ -100,7 +100,7 @@ def test_tables_hold_between_their_velocities(env):
 
 def test_observation_shows_the_velocity(env):
     """The velocity and its standard deviation are last in the scaled observation, if the flow is estimated."""
-    observation, _ = env.reset(seed=3)
+    observation, _ = env.reset(seed=1)
     for action in some_pairs()[:3]:
         observation = env.step(int(action))[0]
     (velocity,), (std,) = observation["velocity"], observation["velocity_std"]

@@ -35,7 +35,7 @@ def test_a_pair_and_its_currents_are_the_same():
     pair = make("reduced", longer={"instrument": {"noise_floor": 2e-4}})
     free = make("reduced", CURRENTS)
     for env in (pair, free):
-        env.reset(seed=2)
+        env.reset(seed=1)
     for action in some_pairs()[:3]:
         currents = np.zeros(16, dtype=np.float32)
         currents[electrode_pairs(16)[action]] = 1.0, -1.0

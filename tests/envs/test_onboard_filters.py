@@ -36,7 +36,7 @@ def test_filter_is_the_full_one_of_a_baseline(name, estimator):
     deviations of patch averages; the RMS difference of the reduced one is less than 1 mol/m³, with
     a learned inflow also than a tenth of the standard deviation."""
     env = make(estimator, name).unwrapped
-    observation, _ = env.reset(seed=3)
+    observation, _ = env.reset(seed=1)
     ours = of_a_baseline(name, env)
     first = CalibrationFrame(env.task)
     for voltages, currents in zip(observation["frame"], env.world.currents, strict=True):
@@ -74,7 +74,7 @@ def test_design_criteria_are_decreases_of_the_expected_error(name):
     """A criterion is the decrease of the expected error over the region by a pair, or of its later content; the
     posterior covariance is the filter's after the injection."""
     env = make("reduced", name).unwrapped
-    belief = Belief(env.rules, env.reset(seed=3)[0])
+    belief = Belief(env.rules, env.reset(seed=1)[0])
     for pair in (7, 100, 3):
         predicted = belief.predict_covariance()
         after, expected = belief.posterior_covariance(predicted, pair), belief.expected_error(predicted)
@@ -118,8 +118,8 @@ def test_trial_errors_are_those_of_actions_without_noise(name):
 def test_one_step_oracle_injects_the_best_pair_of_the_reduced_filter():
     """The oracle has its own reduced filter of the episode, also where the environment has the full one."""
     env, twin = make("full", FAULTS).unwrapped, make("reduced", FAULTS).unwrapped.core
-    observation, _ = env.reset(seed=3)
-    twin.reset([3])
+    observation, _ = env.reset(seed=1)
+    twin.reset([1])
     policy = load_method("one_step_oracle", "injection").make(twin.rules, np.random.default_rng(0), env.core)
     while env.core.t < env.world.n_steps:
         best = twin.trial_errors(np.arange(120)).argmin()

@@ -18,8 +18,8 @@ each_lag = pytest.mark.parametrize("name", [PIPE, LAGGED, SMOOTHING])
 
 
 def make(name=PIPE, num_envs=3, mode="vector_entry_point", **kwargs):
-    """Make the vectorised environment on the id's short world, with three training episodes."""
-    return gym.make_vec(name, num_envs=num_envs, vectorization_mode=mode, **short(name) | {"episodes": 3} | kwargs)
+    """Make the vectorised environment on the id's short world, with two training episodes."""
+    return gym.make_vec(name, num_envs=num_envs, vectorization_mode=mode, **short(name) | kwargs)
 
 
 def actions_for(envs, steps, seed=0):
@@ -61,7 +61,7 @@ def assert_same_play(one, other):
             assert_same_array(mine[k], theirs[k])
 
 
-@pytest.mark.parametrize(("name", "num_envs"), [(PIPE, 1), *((name, 5) for name in KINDS if name != SOLID)])
+@pytest.mark.parametrize(("name", "num_envs"), [(PIPE, 1), *((name, 3) for name in KINDS if name != SOLID)])
 def test_same_as_scalar_environments(name, num_envs):
     """Over three episodes, two of them after an autoreset, it equals gymnasium's SyncVectorEnv."""
     mine = make(name, num_envs)
@@ -76,8 +76,8 @@ def test_same_as_scalar_environments(name, num_envs):
     world = mine.unwrapped.world
     length = world.n_steps + lag_steps(world, entry(name).settings.get("lag", 0))
     actions = actions_for(mine, 3 * (length + 1) + 2)
-    ours = play(mine, actions, seed=1)
-    assert_same_play(ours, play(sync, actions, seed=1))
+    ours = play(mine, actions, seed=0)
+    assert_same_play(ours, play(sync, actions, seed=0))
     ends = [i for i, step in enumerate(ours) if step[2].all()]
     assert ends == [length, 2 * length + 1, 3 * length + 2]
     assert sum(step[2].any() for step in ours) == 3
@@ -95,7 +95,7 @@ def test_later_resets_are_those_of_scalar_environments(name):
     """Resets with any sequence of seeds, partly None, during an episode or without a seed, are equal."""
     mine = make(name)
     sync = make(name, mode="sync")
-    seeds = [4, 0, 9], None, [None, 7, None], 2, None, (1, 1, None), np.int64(5)
+    seeds = [2, 0, 3], None, [None, 1, None], 2, None, (1, 1, None), np.int64(1)
     for k, seed in enumerate(seeds):
         actions = actions_for(mine, 2 + 9 * (k % 2), seed=k)
         theirs = int(seed) if isinstance(seed, np.int64) else seed
@@ -133,7 +133,7 @@ def test_observations_are_fresh_and_within_their_space(name):
         for k in range(3):
             one = {key: array[k] for key, array in step[0].items()}
             assert envs.single_observation_space.contains(one)
-    scalar = gym.make(name, **short(name) | {"episodes": 3}).spec
+    scalar = gym.make(name, **short(name)).spec
     through_json = EnvSpec.from_json(envs.spec.to_json())
     for again in (gym.make_vec(through_json), gym.make_vec(scalar, num_envs=3)):
         assert type(again.unwrapped) is type(envs.unwrapped) and again.num_envs == 3
