@@ -247,8 +247,9 @@ def successful_results(jobs: Iterable[Job],
             key = (result["environment"]["name"], result["method"], result["version"],
                    result["seed"])
             first.setdefault(key, result)
-    keys = {job: (job.environment.name, job.load().name, job.load().version, format_seed(job.seed))
-            for job in jobs}
+    loaded = {job[:2]: job.load() for job in {job[:2]: job for job in jobs}.values()}
+    keys = {job: (job.environment.name, loaded[job[:2]].name, loaded[job[:2]].version,
+                  format_seed(job.seed)) for job in jobs}
     return {job: first[key] for job, key in keys.items() if key in first}
 
 

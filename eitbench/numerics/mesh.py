@@ -162,7 +162,8 @@ class Mesh:
         corner = self.points[facets]                                                # (k, f, d, d)
         edges = corner[:, :, 1:] - corner[:, :, :1]
         gram = edges @ np.swapaxes(edges, 2, 3)
-        local = np.linalg.solve(gram, edges @ (points[:, None] - corner[:, :, 0])[..., None])[..., 0]
+        from_corner = points[:, None] - corner[:, :, 0]
+        local = np.linalg.solve(gram, edges @ from_corner[..., None])[..., 0]
         weights = np.concatenate([1.0 - local.sum(axis=2, keepdims=True), local], axis=2)
         weights = np.clip(weights, 0.0, None)
         weights /= weights.sum(axis=2, keepdims=True)
