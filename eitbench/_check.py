@@ -100,9 +100,12 @@ def choice(name: str, value: object, known: Iterable[str]) -> None:
 
 
 def did_you_mean(given: object, known: Iterable[str]) -> str:
-    """Return ``. Did you mean …?`` with the most similar name, if any, to append to a message."""
+    """Return ``. Did you mean …?`` with the most similar name, or the shortest that contains the
+    given one, if any, to append to a message."""
     names = {name.casefold(): name for name in known}
-    found = difflib.get_close_matches(str(given).casefold(), names, n=1)
+    text = str(given).casefold()
+    found = (difflib.get_close_matches(text, names, n=1)
+             or sorted((name for name in names if text and text in name), key=len))
     return f". Did you mean {names[found[0]]}?" if found else ""
 
 

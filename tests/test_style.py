@@ -9,14 +9,14 @@ import pytest
 
 ROOT = Path(__file__).parent.parent
 PACKAGE = ROOT / "eitbench"
-BUDGETS = {"numerics": 1676, "scoring": 205, "physics": 1716, "worlds": 2782, "data": 1505, "estimation": 6885,
-           "measured": 2100, "envs": 1686, "bench": 4744, "report": 2750, "rl": 874, "cli": 1013}
+BUDGETS = {"numerics": 1677, "scoring": 205, "physics": 1716, "worlds": 2782, "data": 1505, "estimation": 6885,
+           "measured": 2100, "envs": 1686, "bench": 4745, "report": 2750, "rl": 874, "cli": 1013}
 """Package (or module) -> lines of Python allowed, blank lines and docstrings included. Each imports only from those
 before it."""
 TOP = 433
 """Lines allowed in the other modules at the top: public names, argument checks, files, messages."""
 BASELINES = 2303
-TESTS = 19_907
+TESTS = 19_908
 MODULES = {".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__"): path
            for path in PACKAGE.rglob("*.py")}
 

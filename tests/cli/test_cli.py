@@ -179,6 +179,7 @@ def test_documented_commands_are_commands():
     (["run", "--seeds", "dev:1-"], "seeds must look like 'test:0-4'"),
     (["run", "--seeds", "0-3"], "seeds must have a split: train:0-3, dev:0-3 or test:0-3; got '0-3'"),
     (["run", "--env", "eitbench/pip2D-v0"], "Did you mean eitbench/Pipe2D-v0?"),
+    (["run", "--env", "Pipe2D"], "Did you mean eitbench/Pipe2D-v0?"),
     (["run", "--baseline", "kalman_fliter"], "Did you mean kalman_filter?"),
     (["run", "--set", "instrument.noise_relativ=0.1"], "Did you mean noise_relative?"),
     (["compare", "kalmann_filter", "homogeneous"], "Did you mean kalman_filter?"),
