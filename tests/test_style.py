@@ -13,7 +13,7 @@ BUDGETS = {"numerics": 1677, "scoring": 205, "physics": 1716, "worlds": 2782, "d
            "measured": 2100, "envs": 1686, "bench": 4745, "report": 2750, "rl": 874, "cli": 1013}
 """Package (or module) -> lines of Python allowed, blank lines and docstrings included. Each imports only from those
 before it."""
-TOP = 433
+TOP = 436
 """Lines allowed in the other modules at the top: public names, argument checks, files, messages."""
 BASELINES = 2303
 TESTS = 19_908
