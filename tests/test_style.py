@@ -16,7 +16,7 @@ before it."""
 TOP = 436
 """Lines allowed in the other modules at the top: public names, argument checks, files, messages."""
 BASELINES = 2303
-TESTS = 19_908
+TESTS = 19_909
 MODULES = {".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__"): path
            for path in PACKAGE.rglob("*.py")}
 

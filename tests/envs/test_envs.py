@@ -21,6 +21,7 @@ import injection_envs
 from injection_envs import BUDGET, CURRENTS, FAULTS, FLOW, INJECTION, NAME, TANK, arrays_of, play, some_actions
 from short import SHORT, short
 
+READINGS = "eitbench/TankReadings-v0"
 POLICIES = [*((id, "reduced", "raw") for id in INJECTION), (NAME, "reduced", "scaled"), (BUDGET, "reduced", "scaled"),
             (FLOW, "reduced", "scaled"), (NAME, "none", "raw"), (CURRENTS, "none", "raw")]
 """(id, estimator, observation) of each kind of injection environment."""
@@ -34,7 +35,7 @@ def test_every_id_has_a_short_version():
 
 
 def unless_slow(ids, fast):
-    """Mark ids that are not in ``fast`` as slow: spaces and classes are the same, only numbers differ."""
+    """Mark ids that are not in ``fast`` as slow: each has the classes and spaces of one that is."""
     return [pytest.param(id, marks=() if id in fast else pytest.mark.slow) for id in ids]
 
 
@@ -46,7 +47,7 @@ def test_checkers_pass(id):
     check_env_sb3(make(id, episodes=1).unwrapped)
 
 
-@pytest.mark.parametrize("id", unless_slow(INJECTION, (NAME, CURRENTS, BUDGET, FAULTS, TANK)))
+@pytest.mark.parametrize("id", unless_slow(INJECTION, (NAME, CURRENTS, BUDGET, FAULTS, FLOW, TANK, READINGS)))
 @pytest.mark.parametrize("kwargs", [{}, {"observation": "raw"}, {"observation": "raw", "estimator": "none"}])
 @pytest.mark.filterwarnings("ignore")
 def test_checkers_pass_for_policies(id, kwargs):
