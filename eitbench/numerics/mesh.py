@@ -155,9 +155,8 @@ class Mesh:
     def _nearest_wall(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the cells of the nearest boundary facets, and coordinates of the projections."""
         tree, reach = self._wall_tree
-        distance = cKDTree(self.points[np.unique(self.boundary_facets)]).query(points)[0]
-        near = _rectangular(tree.query_ball_point(points, (1.0 + 1e-9) * (distance + reach),
-                                                  return_sorted=True))
+        radius = (1.0 + 1e-9) * (tree.query(points)[0] + reach)
+        near = _rectangular(tree.query_ball_point(points, radius, return_sorted=True))
         facets, cells = (array[near] for array in self._boundary)
         corner = self.points[facets]                                                # (k, f, d, d)
         edges = corner[:, :, 1:] - corner[:, :, :1]
@@ -192,7 +191,7 @@ class Mesh:
         return candidates[row, which], barycentric[row, which]
 
 
-def _parts(chosen: np.ndarray, size: int = 1000) -> list[np.ndarray]:
+def _parts(chosen: np.ndarray, size: int = 100) -> list[np.ndarray]:
     """Return the numbers of the chosen points, in parts that limit the memory."""
     numbers = np.flatnonzero(chosen)
     return [numbers[begin:begin + size] for begin in range(0, len(numbers), size)]

@@ -21,7 +21,7 @@ import injection_envs
 from injection_envs import BUDGET, CURRENTS, FAULTS, FLOW, INJECTION, NAME, TANK, arrays_of, play, some_actions
 from short import SHORT, short
 
-READINGS = "eitbench/TankReadings-v0"
+READINGS, WAITED = "eitbench/TankReadings-v0", "eitbench/Pipe2DInjectionInflowBudget-v0"
 POLICIES = [*((id, "reduced", "raw") for id in INJECTION), (NAME, "reduced", "scaled"), (BUDGET, "reduced", "scaled"),
             (FLOW, "reduced", "scaled"), (NAME, "none", "raw"), (CURRENTS, "none", "raw")]
 """(id, estimator, observation) of each kind of injection environment."""
@@ -47,7 +47,7 @@ def test_checkers_pass(id):
     check_env_sb3(make(id, episodes=1).unwrapped)
 
 
-@pytest.mark.parametrize("id", unless_slow(INJECTION, (NAME, CURRENTS, BUDGET, FAULTS, FLOW, TANK, READINGS)))
+@pytest.mark.parametrize("id", unless_slow(INJECTION, (NAME, CURRENTS, WAITED, FAULTS, FLOW, TANK, READINGS)))
 @pytest.mark.parametrize("kwargs", [{}, {"observation": "raw"}, {"observation": "raw", "estimator": "none"}])
 @pytest.mark.filterwarnings("ignore")
 def test_checkers_pass_for_policies(id, kwargs):
