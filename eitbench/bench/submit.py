@@ -7,13 +7,10 @@ from pathlib import Path
 from typing import Any
 
 from eitbench.bench import tracks
-from eitbench.bench.records import read_record, split_of, write_record
+from eitbench.bench.records import read_record, record_file_name, split_of, write_record
 from eitbench.bench.run import Job, make_jobs, pending_jobs, run_jobs
 from eitbench.bench.store import EpisodeStore, provenance, record_results
 from eitbench.data.seeds import format_seed, seed_ranges
-
-Version = tuple[str, str, str]
-"""Environment, method and version, as in a record."""
 
 
 def submit(method: str | None, environments: list[str], seeds: list[int] | None,
@@ -59,40 +56,33 @@ def _submitted(jobs: list[Job], store: EpisodeStore, to: Path, official: bool, n
     before = [result for record in earlier.values() if record["official"] == official
               for result in record_results(record)]
     run_jobs(pending_jobs(jobs, before), store, n_jobs=n_jobs, backend=backend, command=command)
-    made = {(record["environment"]["name"], record["method"], record["version"]):
-            record | {"official": official} for record in store.records(also=before)
-            if record["split"] == "test"}
-    asked = _versions(jobs)
-    for version in asked:
-        if version not in made:
-            environment, method, _ = version
-            raise ValueError(f"{store.folder} holds no valid result of {method} in {environment}")
-        old = earlier.get(version, made[version])
-        if missing := [seed for seed in old["seeds"] if seed not in made[version]["seeds"]]:
+    made = {to / record_file_name(record): record | {"official": official}
+            for record in store.records(also=before) if record["split"] == "test"}
+    asked = _record_paths(to, jobs)
+    for path, job in asked.items():
+        if path not in made:
+            raise ValueError(f"{store.folder} holds no valid result of {job.load().name} in "
+                             f"{job.environment.name}")
+        old = earlier.get(path, made[path])
+        if missing := [seed for seed in old["seeds"] if seed not in made[path]["seeds"]]:
             raise ValueError("to must not hold a record with other episodes; "
-                             f"{_path(to, version)} would lose its episodes {seed_ranges(missing)}")
-    for version in asked:
-        yield write_record(to, made[version])
+                             f"{path} would lose its episodes {seed_ranges(missing)}")
+    for path in asked:
+        yield write_record(to, made[path])
 
 
-def _versions(jobs: list[Job]) -> list[Version]:
-    """Return environment, method and version of the jobs, without duplicates."""
-    return list(dict.fromkeys((job.environment.name, job.load().name, job.load().version)
-                              for job in jobs))
+def _record_paths(to: Path, jobs: list[Job]) -> dict[Path, Job]:
+    """Map the path of the record of each version of a method to one of its jobs."""
+    return {to / tracks.record_name(job.environment.name, job.load().name, job.load().version,
+                                    "test"): job for job in jobs}
 
 
-def _path(to: Path, version: Version) -> Path:
-    """Return the path of the record of test episodes of a version in the folder ``to``."""
-    return to / tracks.record_name(*version, "test")
-
-
-def _earlier(to: Path, jobs: list[Job], official: bool) -> dict[Version, dict[str, Any]]:
+def _earlier(to: Path, jobs: list[Job], official: bool) -> dict[Path, dict[str, Any]]:
     """Read the records in ``to`` of the jobs' versions of methods. ``ValueError`` if one of them is
     official and the new one is not."""
-    found = {version: read_record(_path(to, version)) for version in _versions(jobs)
-             if _path(to, version).exists()}
-    for version, record in found.items():
+    found = {path: read_record(path) for path in _record_paths(to, jobs) if path.exists()}
+    for path, record in found.items():
         if record["official"] and not official:
-            raise ValueError(f"to must not hold an official record; {_path(to, version)} would "
-                             "lose its official status")
+            raise ValueError(f"to must not hold an official record; {path} would lose its "
+                             "official status")
     return found

@@ -47,11 +47,12 @@ def _places(half: float, value: float) -> int | None:
     return min(max(place, 0), 5)
 
 
-def scores_by_seed(record: dict[str, Any], name: str) -> dict[str, float]:
-    """Return seed -> score in the units of tables, for the episodes that have it."""
+def scores_by_seed(record: dict[str, Any] | None, name: str = "error") -> dict[str, float]:
+    """Return seed -> score in the units of tables, for the episodes that have it; nothing without a
+    record."""
     # records of older code have fewer scores
     values = {episode["seed"]: episode["scores"].get(name)
-              for episode in record["episodes"] if episode["status"] == "ok"}
+              for episode in (record or {}).get("episodes", ()) if episode["status"] == "ok"}
     known = scores()
     factor = known[name].factor if name in known else 1.0
     return {seed: value * factor for seed, value in values.items() if value is not None}

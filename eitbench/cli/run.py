@@ -113,7 +113,7 @@ def print_report(out: Path, asked: Sequence[Job] = (), worlds: Sequence[dict[str
     records = store.write_records()
     if not records and not before:
         raise typer.BadParameter(f"no results in {out}; create some with `eitbench run`")
-    known = {**bundled_anchors(records), **anchors(records)}
+    known = {**bundled_anchors(), **anchors(records)}
     boards = run_leaderboards(records, known)
     write_atomically(out / "leaderboard.md", markdown(boards).encode())
     told = select_requested(store.records(before), asked) if asked else records

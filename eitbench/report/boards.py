@@ -315,10 +315,10 @@ def _board(records: list[dict[str, Any]], known: Anchors, products: dict[str, fl
     floor = naive_baseline_record(records)
     shown = [floor] if floor and ranked else records
     seeds = {seed for record in shown for seed in record["seeds"]}
-    zero = episode_scores(floor)
+    zero = scores_by_seed(floor)
     rows = sorted((_row(record, seeds, zero, known, products) for record in records
                    if not seeds.isdisjoint(record["seeds"])), key=MethodRow.place)
-    scores = {row.label: {environment: episode_scores(row.record)} for row in rows
+    scores = {row.label: {environment: scores_by_seed(row.record)} for row in rows
               if ranked and not row.cells["note"]}
     return Leaderboard(record_category(records[0]), environment, environment_title(records[0]),
                        _with_ranks(rows, scores))
@@ -344,7 +344,7 @@ def _row(whole: dict[str, Any], seeds: set[str], zero: dict[str, float], known: 
          products: dict[str, float]) -> MethodRow:
     """Return the row of a record on the board with these seeds, without its rank."""
     record = restrict(whole, seeds)
-    errors = episode_scores(record)
+    errors = scores_by_seed(record)
     failed = sum(episode["status"] != "ok" for episode in whole["episodes"])
     missing = len(seeds - set(record["seeds"]))
     note = [record["role"], "privileged" * record["privileged"], f"{failed} failed" * bool(failed),
@@ -367,8 +367,8 @@ def _agent_mean(board: Leaderboard, rows: list[MethodRow]) -> MethodRow:
     for name in (*INTERVAL_HEADINGS, *headings()):
         values = [row.cells[name] for row in ranked if row.cells[name] is not None]
         cells[name] = float(np.mean(values)) if values else None
-    if errors := mean_by_seed([episode_scores(row.record) for row in ranked]):
-        cells |= _error_and_skill(errors, episode_scores(naive_baseline_record(board.records)))
+    if errors := mean_by_seed([scores_by_seed(row.record) for row in ranked]):
+        cells |= _error_and_skill(errors, scores_by_seed(naive_baseline_record(board.records)))
     else:
         cells |= {"gain_low": None, "gain_high": None}
     versions = {row.cells["version"] for row in ranked}
@@ -405,11 +405,6 @@ def is_naive_baseline(record: dict[str, Any]) -> bool:
             and version_number(record["version"]) is not None)
 
 
-def episode_scores(record: dict[str, Any] | None, name: str = "error") -> dict[str, float]:
-    """Return seed -> score of a record, ẽ_c by default; nothing without a record."""
-    return scores_by_seed(record, name) if record else {}
-
-
 def skill_scores(zero: dict[str, float], errors: dict[str, float]) -> dict[str, float]:
     """Return seed -> skill score relative to the errors ``zero`` of the naive baseline."""
     return {seed: 1.0 - error / zero[seed] for seed, error in errors.items() if zero.get(seed)}
@@ -438,17 +433,10 @@ def _with_interval(name: str, values: dict[str, dict[str, float]],
 
 def aggregate_environments() -> set[str]:
     """Return the names of the environments of aggregates: all registered ids with their default
-    arguments, without shifted environments, which have a separate leaderboard, and without
-    `reference_environments`."""
+    arguments, without shifted environments, which have a separate leaderboard, and without those in
+    which no known policy is better than fixed injections."""
     return {tracks.environment_name(each.id, {}) for each in entries().values()
             if not each.nominal and not each.is_reference}
-
-
-def reference_environments() -> set[str]:
-    """Return the names of the environments in which no known policy is better than fixed
-    injections."""
-    return {tracks.environment_name(each.id, {}) for each in entries().values()
-            if each.is_reference}
 
 
 def _aggregate(category: str, made: list[Leaderboard]) -> list[Leaderboard]:
@@ -516,12 +504,10 @@ def anchors(records: Iterable[dict[str, Any]]) -> Anchors:
     return {key: scores_by_seed(record, "error") for key, record in found.items()}
 
 
-def bundled_anchors(records: Iterable[dict[str, Any]]) -> Anchors:
-    """Return the `anchors` of the worlds of these records among the records of the package."""
-    kinds = {base_environment(record["environment"]["id"]) for record in records}
+def bundled_anchors() -> Anchors:
+    """Return the `anchors` of the records of the package."""
     published = read_episode_table(table_path(bundled_path("leaderboards") / "results"))
-    return anchors(record for record in published if not record["environment"]["kwargs"]
-                   and base_environment(record["environment"]["id"]) in kinds)
+    return anchors(record for record in published if not record["environment"]["kwargs"])
 
 
 def _normalised_score(record: dict[str, Any], known: Anchors) -> float | None:

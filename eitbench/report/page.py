@@ -22,7 +22,7 @@ from eitbench.bench import tracks
 from eitbench.bench.records import group_runs
 from eitbench.bench.run import Job
 from eitbench.bench.store import EpisodeStore
-from eitbench.bench.text import seed_ranges
+from eitbench.bench.text import scores_by_seed, seed_ranges
 from eitbench.bench.tracks import Environment
 from eitbench.data.episode_cache import truth_mesh
 from eitbench.data.episodes import simulate
@@ -30,7 +30,7 @@ from eitbench.data.seeds import format_seed, parse_seeds
 from eitbench.envs.rendering import FIELD_COLORMAP, colour_range, draw_field
 from eitbench.numerics.mesh import Mesh
 from eitbench.report import tables
-from eitbench.report.boards import Leaderboard, episode_scores, restrict
+from eitbench.report.boards import Leaderboard, restrict
 from eitbench.report.sweep import Sweep
 from eitbench.report.templates import data_uri, figure_image, render_template
 from eitbench.worlds.task import Task
@@ -101,9 +101,9 @@ def _snapshots(store: EpisodeStore, board: Leaderboard) -> dict[str, Any] | None
     """Return truth and estimates in one episode, of the user's methods first and then of the best,
     without naive baselines, as PNG data; None if estimates are missing or do not fit the states."""
     chosen = [row.record for row in sorted(board.rows, key=lambda row: row.is_builtin)
-              if row.record and episode_scores(row.record) and "floor" not in row.badges]
+              if row.record and scores_by_seed(row.record) and "floor" not in row.badges]
     chosen = chosen[:N_SNAPSHOT_METHODS]
-    shared = set.intersection(*(set(episode_scores(each)) for each in chosen)) if chosen else ()
+    shared = set.intersection(*(set(scores_by_seed(each)) for each in chosen)) if chosen else ()
     environment = board.records[0]["environment"]
     if not shared or environment["id"] not in tracks.ids():  # its module may not be imported
         return None

@@ -8,9 +8,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from eitbench.bench.table import Table, mean_cell, number_cell
+from eitbench.bench.text import scores_by_seed
 from eitbench.bench.variants import flatten, format_setting
 from eitbench.report import charts
-from eitbench.report.boards import base_environment, episode_scores
+from eitbench.report.boards import base_environment
 from eitbench.report.tables import MAX_LABEL_CHARS
 
 
@@ -78,7 +79,7 @@ def sweeps(records: Iterable[dict[str, Any]], number: str) -> list[Sweep]:
         values[name] = value
         title = f"{base_environment(record['environment']['id'])}, {record['board']}"
         methods = boards.setdefault(title, {})
-        methods.setdefault(record["method"], {})[name] = list(episode_scores(record).values())
+        methods.setdefault(record["method"], {})[name] = list(scores_by_seed(record).values())
     names = sorted(values, key=lambda name: (  # numbers first
         (0, values[name]) if isinstance(values[name], int | float) else (1, name)))
     return [Sweep(title, number, [values[name] for name in names],

@@ -12,7 +12,7 @@ import numpy as np
 
 from eitbench._sanitize import escape_markdown
 from eitbench.bench.table import MISSING, Cell, Table, mean_cell, number_cell
-from eitbench.bench.text import format_interval, format_number
+from eitbench.bench.text import format_interval, format_number, scores_by_seed
 from eitbench.report import charts
 from eitbench.report.boards import (
     COST_COLUMNS,
@@ -21,7 +21,6 @@ from eitbench.report.boards import (
     MethodRow,
     column_descriptions,
     columns,
-    episode_scores,
     headings,
     naive_baseline_record,
 )
@@ -166,7 +165,7 @@ def run_table(board: Leaderboard, *, title: str = "title", drawn: bool = False) 
     others = [name for name in headings() if name not in (score, *COST_COLUMNS)]
     rows = []
     for row, played in zip(board.rows, seeds, strict=True):
-        name, own = row.cells[title], episode_scores(row.record, score)
+        name, own = row.cells[title], scores_by_seed(row.record, score)
         cells: dict[str, Cell | str] = {
             "method": Cell(name, name, badges=("privileged",) * ("privileged" in row.badges))}
         if len(set(seeds)) > 1:
@@ -176,7 +175,7 @@ def run_table(board: Leaderboard, *, title: str = "title", drawn: bool = False) 
         else:
             cells[columns()[score][0]] = mean_cell(own.values())
         if best:
-            other = episode_scores(best.record)
+            other = scores_by_seed(best.record)
             cells[f"difference to {best.cells['method']}"] = Cell(MISSING) if row is best else (
                 mean_cell(own[seed] - other[seed] for seed in own.keys() & other.keys()))
         cells |= _number_cells(row, others)

@@ -28,7 +28,7 @@ def test_the_published_table_agrees_with_the_records():
     times = full["metric"] == "seconds_per_step"
     pd.testing.assert_frame_equal(shipped[~times], full[~times], check_exact=False, rtol=6e-5, atol=0.0)
     exact = anchors(records)
-    assert bundled_anchors(records) == {key: pytest.approx(errors, rel=6e-5) for key, errors in exact.items()}
+    assert bundled_anchors() == {key: pytest.approx(errors, rel=6e-5) for key, errors in exact.items()}
 
 
 def test_published_records_name_no_folder_of_a_machine():

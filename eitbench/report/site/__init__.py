@@ -37,11 +37,11 @@ from eitbench.report.boards import (
     headings,
     leaderboard_table,
     leaderboards,
-    reference_environments,
 )
 from eitbench.report.charts import Axis
 from eitbench.report.site import measured, robustness
 from eitbench.report.templates import markdown, render_template
+from eitbench.worlds.registry import entries
 
 CATEGORY_TEXTS = {
     "filter": "Each state is estimated from the measurements until then (filtering).",
@@ -165,7 +165,7 @@ def write_site(folder: Path, files: Mapping[str, bytes]) -> None:
 
 def index_page(site: Site) -> bytes:
     """Return the HTML of ``index.html``."""
-    apart, names = reference_environments(), aggregate_environments()
+    apart = {environment_name(id, {}) for id, each in entries().items() if each.is_reference}
     shown = {board.anchor: tables.page_table(board, "", compact=True) for board in site.boards
              if board.environment not in apart}
     filters, policies = site.board("filter", ALL), site.board("injection", AGENT_ENVIRONMENT)
@@ -174,8 +174,9 @@ def index_page(site: Site) -> bytes:
     return site.page(
         "index", headline=headline(site), filters=filters, policies=policies,
         best_filters=best[0], best_policies=best[1],
-        n_filter_environments=sum(board.category == "filter" and board.environment in names
-                                  for board in site.boards),
+        n_filter_environments=sum(
+            board.category == "filter" and board.environment in aggregate_environments()
+            for board in site.boards),
         moving=site.address(HEADLINE[0]), still=site.address(HEADLINE[1]),
         shown=shown, about=CATEGORY_TEXTS,
         last=max(map(finished_at, site.records), default="")[:10],
