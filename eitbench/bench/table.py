@@ -69,7 +69,7 @@ class Table(NamedTuple):
                 else "words" if any(isinstance(cell.value, str) for cell in column) else ""
                 for column in columns]
 
-    def fit_width(self, width: int, order: Sequence[str] = ()) -> Table:
+    def fit_width(self, width: int, order: Sequence[str]) -> Table:
         """Return the table without the columns for which ``width`` characters are too few: columns
         that are not in ``order`` are omitted first, then the last in ``order``."""
         table = self
@@ -81,11 +81,6 @@ class Table(NamedTuple):
             rows = [row._replace(cells=row.cells[:i] + row.cells[i + 1:]) for row in table.rows]
             table = Table(table.headings[:i] + table.headings[i + 1:], rows, table.label)
         return table
-
-    def omitted_columns(self, fitted: Table) -> str:
-        """Return a line with the columns that a `fit_width` table lacks; empty without any."""
-        missing = [heading for heading in self.headings if heading not in fitted.headings]
-        return f"columns omitted: {', '.join(missing)}" if missing else ""
 
     def markdown(self) -> str:
         """Return aligned Markdown."""

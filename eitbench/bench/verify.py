@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -38,14 +38,8 @@ EMPTY_ROW = {"record": "", "environment": "", "method": "", "episode": "", "isol
              "score": "", "difference": 0.0, "recorded": None, "rerun": None, "problem": "",
              "note": ""}
 """Columns of `verify`, with the values of a record that cannot be read."""
-
-
-class EpisodeCheck(NamedTuple):
-    """One episode of one record, to be rerun by a `Job` or, without a job, replayed."""
-
-    record: dict[str, Any]
-    episode: dict[str, Any]
-    job: Any
+Case = tuple[dict[str, Any], dict[str, Any], Any]
+"""A record, one of its episodes, and the `Job` that reruns it; None if it is replayed."""
 
 
 def verify(paths: Sequence[Path], folder: Path, *, file: str | None = None, isolate: str = "auto",
@@ -66,7 +60,7 @@ def verify(paths: Sequence[Path], folder: Path, *, file: str | None = None, isol
     """
     _check.integer("episodes", episodes, low=1)
     rows: list[dict[str, Any]] = []
-    cases: list[EpisodeCheck] = []
+    cases: list[Case] = []
     for path in paths:
         try:
             record = stored.read_record(path)
@@ -79,15 +73,15 @@ def verify(paths: Sequence[Path], folder: Path, *, file: str | None = None, isol
         drawn = np.random.default_rng(seed).permutation(len(record["episodes"]))[:episodes]
         for episode in (record["episodes"][k] for k in sorted(drawn)):
             numbered = job and job._replace(seed=parse_seeds(episode["seed"])[0])
-            cases.append(EpisodeCheck(record, episode, numbered))
+            cases.append((record, episode, numbered))
     with use_cache_dir((folder / "cache").absolute()):
         if replay:
-            work = [(k, case.record, case.episode) for k, case in enumerate(cases)]
+            work = [(k, record, episode) for k, (record, episode, _) in enumerate(cases)]
             bar = tqdm(run_parallel(_replay, work, n_jobs, backend), total=len(work),
                        desc="replaying", unit="episode", disable=None)
-            rows += [_compared(cases[k], result, []) for k, result in sorted(bar)]
+            rows += [_compared(cases[k], result) for k, result in sorted(bar)]
         else:
-            rows += _rerun_rows(cases, folder, n_jobs, backend)
+            rows += [_compared(*each) for each in _reruns(cases, folder, n_jobs, backend)]
     return pd.DataFrame([EMPTY_ROW | row for row in rows])
 
 
@@ -183,55 +177,48 @@ def is_builtin_record(record: dict[str, Any], method: str) -> bool:
 # -- one episode --------------------------------------------------------------------------------
 
 
-def _rerun_rows(cases: list[EpisodeCheck], folder: Path, n_jobs: int, backend: str,
-                ) -> list[dict[str, Any]]:
-    """Run the episodes that are not stored in the folder, and compare. Versions of a method have
-    separate stores, as third-party methods may share a name; so have kinds of isolation."""
-    found: dict[Path, list[EpisodeCheck]] = {}
-    for case in cases:
-        place = folder / case.job.isolation / case.record["version"]
-        found.setdefault(place, []).append(case)
-    rows = []
-    for place, own in found.items():
+def _reruns(cases: list[Case], folder: Path, n_jobs: int, backend: str,
+            ) -> Iterator[tuple[Case, dict[str, Any]]]:
+    """Run the episodes that are not stored in the folder; yield all with their new results.
+    Versions of a method have separate stores, as third-party methods may share a name; so have
+    kinds of isolation."""
+    places: dict[Path, list[Case]] = {}
+    for record, episode, job in cases:
+        place = folder / job.isolation / record["version"]
+        places.setdefault(place, []).append((record, episode, job))
+    for place, own in places.items():
         store = EpisodeStore(place)
-        run_jobs([case.job for case in own], store, n_jobs=n_jobs, backend=backend,
+        run_jobs([job for *_, job in own], store, n_jobs=n_jobs, backend=backend,
                  keep_estimates=False)
-        rows += [_rerun_row(case, store) for case in own]
-    return rows
+        for case in own:
+            job = case[2]
+            yield case, store.result(job.environment.name, job.load().name, job.seed)
 
 
-def _rerun_row(case: EpisodeCheck, store: EpisodeStore) -> dict[str, Any]:
-    """Compare a stored rerun with the record."""
-    record, _, job = case
-    method = job.load()
-    result = store.result(job.environment.name, method.name, job.seed)
-    fields = BUILTIN_FIELDS if is_builtin_record(record, job.method) else stored.COMMON_FIELDS
-    problems = [f"{name} is {result[name]!r}, but {record[name]!r} in the record"
-                for name in fields if result[name] != record[name]]
-    now, then = version_number(method.version), version_number(record["version"])
-    note = ""
-    if now and then and then < now:
-        note = f"the record is of {record['version']}, and {record['method']} is now v{now}"
-    if now and then and then > now:
-        problems.append(f"the record is of {record['version']}, but {record['method']} is v{now}")
-    return _compared(case, result, problems) | {"note": note}
-
-
-def _compared(case: EpisodeCheck, result: dict[str, Any],
-              problems: list[str]) -> dict[str, Any]:
+def _compared(case: Case, result: dict[str, Any]) -> dict[str, Any]:
     """Return the row of an episode and its new result."""
-    differences = score_differences(case.episode, result)
-    worst = max(differences, key=lambda name: differences[name], default="")
-    if result["status"] != case.episode["status"]:
+    record, episode, job = case
+    problems, note = list[str](), ""
+    if job:
+        fields = BUILTIN_FIELDS if is_builtin_record(record, job.method) else stored.COMMON_FIELDS
+        problems = [f"{name} is {result[name]!r}, but {record[name]!r} in the record"
+                    for name in fields if result[name] != record[name]]
+        now, then = version_number(job.load().version), version_number(record["version"])
+        if now and then and then < now:
+            note = f"the record is of v{then}, and {record['method']} is now v{now}"
+        if now and then and then > now:
+            problems.append(f"the record is of v{then}, but {record['method']} is v{now}")
+    if result["status"] != episode["status"]:
         problems.append(f"status is {result['status']} ({result.get('message', 'no error')}), but "
-                        f"{case.episode['status']} in the record")
-    recorded, rerun = (each.get("scores", {}).get("error") for each in (case.episode, result))
-    return {"record": record_file_name(case.record),
-            "environment": case.record["environment"]["id"],
-            "method": case.record["method"], "episode": case.episode["seed"],
-            "isolation": case.job.isolation if case.job else "replay",
-            "score": worst, "difference": differences.get(worst, 0.0),
-            "recorded": recorded, "rerun": rerun, "problem": "; ".join(problems)}
+                        f"{episode['status']} in the record")
+    differences = score_differences(episode, result)
+    worst = max(differences, key=lambda name: differences[name], default="")
+    recorded, rerun = (each.get("scores", {}).get("error") for each in (episode, result))
+    return {"record": record_file_name(record), "environment": record["environment"]["id"],
+            "method": record["method"], "episode": episode["seed"],
+            "isolation": job.isolation if job else "replay",
+            "score": worst, "difference": differences.get(worst, 0.0), "recorded": recorded,
+            "rerun": rerun, "problem": "; ".join(problems), "note": note}
 
 
 def _replay(k: int, record: dict[str, Any],

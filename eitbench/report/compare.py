@@ -196,5 +196,6 @@ def format_comparison(table: pd.DataFrame, a: dict[str, Any], b: dict[str, Any],
     fitted = whole.fit_width(width, first)
     names = [each["method"] + f"@{each['version']}" * (a["method"] == b["method"])
              for each in (a, b)]
+    hidden = [heading for heading in whole.headings if heading not in fitted.headings]
     return "\n\n".join([f"A: {names[0]}\nB: {names[1]}", fitted.markdown(),
-                        *filter(None, [whole.omitted_columns(fitted)])])
+                        *[f"columns omitted: {', '.join(hidden)}"] * bool(hidden)])
