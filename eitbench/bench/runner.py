@@ -42,11 +42,11 @@ class EpisodeRun(NamedTuple):
     """Results of a method in one episode."""
 
     outcome: Outcome
-    currents: np.ndarray
-    """(steps, L) A (A/m in 2D), injected currents of each step"""
-    fields: dict[str, np.ndarray]
+    fields: dict[str, np.ndarray] = {}  # noqa: RUF012 (never changed)
     """Means and standard deviations of estimates as float32, for figures; empty for policies and on
     measurements."""
+    currents: np.ndarray = np.empty((0, 0))
+    """(steps, L) A (A/m in 2D), injections of a policy"""
     actions: list[Any] | None = None
     """actions of a policy, JSON-ready"""
     episode_return: float | None = None
@@ -85,8 +85,7 @@ def run_method(asked: Environment, method: Method, seed: int) -> EpisodeRun:
         return _run_policy(env, method, seed)
     if is_measured(asked.id):
         run = run_on_measurements(env, method, seed, kept={env.episode_steps})
-        measurements = env.measurements
-        return EpisodeRun(run.outcome(env), measurements.currents[measurements.injection_index], {})
+        return EpisodeRun(run.outcome(env))
     return run_estimator(env, method, seed)
 
 
@@ -114,7 +113,7 @@ def run_estimator(env: EstimationEnv, estimator: Method, seed: int) -> EpisodeRu
     functionals = functionals_of(env)
     rows = None if functionals is None else functionals.rows
     output = EstimatorOutput(env.task, _iter_steps(env, estimator, seed, rows))
-    return EpisodeRun(output.outcome(env), output.currents, output.fields())
+    return EpisodeRun(output.outcome(env), output.fields())
 
 
 class Functionals(NamedTuple):
@@ -175,13 +174,12 @@ class EstimatorOutput:
             if estimate is None:
                 continue
             if t >= 1:
-                self.means[t - 1] = estimate.mean
-                if estimate.variance is not None:
-                    self.variances[t - 1] = estimate.variance
-                if estimate.velocity is not None:
-                    self.velocities[t - 1] = estimate.velocity
-                if estimate.velocity_variance is not None:
-                    self.velocity_variances[t - 1] = estimate.velocity_variance
+                for stored, value in ((self.means, estimate.mean),
+                                      (self.variances, estimate.variance),
+                                      (self.velocities, estimate.velocity),
+                                      (self.velocity_variances, estimate.velocity_variance)):
+                    if value is not None:
+                        stored[t - 1] = value
                 if covariance is not None:
                     self.covariances[t] = covariance
             if estimate.innovation is not None and estimate.innovation_covariance is not None:
@@ -304,7 +302,7 @@ def _run_policy(env: InjectionEnv, policy: Method, seed: int) -> EpisodeRun:
         mass=mass, points=truth_mesh(world).points, distances=distances, ospa=ospa, areas=areas,
         innovations=([each.value for each in used],
                      [each.covariance for each in used]) if used else None)
-    return EpisodeRun(outcome, np.array(currents), {}, actions, total)
+    return EpisodeRun(outcome, {}, np.array(currents), actions, total)
 
 
 def iter_injections(env: InjectionEnv, policy: Method, seed: int,

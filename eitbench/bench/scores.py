@@ -185,18 +185,8 @@ def compute_scores(track: str, outcome: Outcome) -> dict[str, float | None]:
     return {name: each(outcome) for name, each in scores(kind).items()}
 
 
-def _velocity_error(outcome: Any) -> float:
-    estimated, true, weights = outcome.velocity
-    return scoring.relative_error(estimated, true, np.diag(weights))
-
-
 def _relative_rms(estimated: np.ndarray, true: np.ndarray) -> float:
     return float(np.sqrt(((estimated - true)**2).sum() / (true**2).sum()))
-
-
-def _solute_amount_error(outcome: Any) -> float:
-    estimated, true = outcome.solute_flow
-    return float(abs(estimated.sum() / true.sum() - 1.0))
 
 
 def _solute_flow_coverage(outcome: Any) -> float:
@@ -254,7 +244,9 @@ for _score in (
     Score("velocity_error", "ẽ_v",
           "relative error of the flow, ∫(v̂ − v)²/∫v² across the pipe, where the task includes the "
           "flow",
-          _velocity_error, requires=("velocity",)),
+          lambda outcome: scoring.relative_error(outcome.velocity[0], outcome.velocity[1],
+                                                 np.diag(outcome.velocity[2])),
+          requires=("velocity",)),
     Score("solute_flow_error", "flow error",
           "relative RMS error of the solute flow through the outlet, ∫ĉ v̂·n against ∫c v·n",
           lambda outcome: _relative_rms(*outcome.solute_flow), requires=("solute_flow",)),
@@ -264,7 +256,8 @@ for _score in (
           _solute_flow_coverage, direction="nominal", requires=("solute_flow_std",)),
     Score("solute_amount_error", "amount error",
           "relative error of the amount of solute that leaves the pipe during the scored states",
-          _solute_amount_error, requires=("solute_flow",)),
+          lambda outcome: abs(outcome.solute_flow[0].sum() / outcome.solute_flow[1].sum() - 1.0),
+          requires=("solute_flow",)),
     Score("section_error", "section error",
           f"relative RMS error of the mean concentration in each of {N_SECTIONS} equal sections "
           "along the pipe",

@@ -15,7 +15,6 @@ from eitbench.cli import options
 
 if TYPE_CHECKING:
     from eitbench.bench.run import Job
-    from eitbench.bench.store import EpisodeStore
 
 Suite = StrEnum("Suite", ["quick", "full"])
 
@@ -105,7 +104,7 @@ def print_report(out: Path, asked: Sequence[Job] = (), worlds: Sequence[dict[str
     from eitbench._files import write_atomically
     from eitbench.bench.store import EpisodeStore
     from eitbench.report.boards import anchors, bundled_anchors, run_leaderboards
-    from eitbench.report.page import select_requested, write_page
+    from eitbench.report.page import failures, select_requested, write_page
     from eitbench.report.policies import gap_text, policy_rows
     from eitbench.report.sweep import sweeps, swept_parameter
     from eitbench.report.tables import markdown, terminal_tables
@@ -126,7 +125,12 @@ def print_report(out: Path, asked: Sequence[Job] = (), worlds: Sequence[dict[str
         jobs = [job for job in asked if job.environment.name == name]
         if gap := gap_text(policy_rows(jobs, [*before, *store.results()])):
             options.echo(f"\n{name}: {gap}")
-    _say_failures(store, told, asked)
+    failed = failures(store, told)
+    for failure in failed:
+        options.echo(failure, err=True)
+    if failed and any(job.isolation != "none" for job in asked):
+        options.echo(f"with --seeds {failed[0].seeds[0]} --isolate none --jobs 1 the method runs "
+                     "in this process, where breakpoint() stops", err=True)
     write_page(store, boards, found)
     options.echo(f"\nwrote {out / 'index.html'}")
 
@@ -134,15 +138,3 @@ def print_report(out: Path, asked: Sequence[Job] = (), worlds: Sequence[dict[str
 def command_line() -> str:
     """Return the command with its arguments."""
     return shlex.join(["eitbench", *sys.argv[1:]])
-
-
-def _say_failures(store: EpisodeStore, records: list[dict[str, Any]],
-                  asked: Sequence[Job]) -> None:
-    """Print the failures, and how to debug the first."""
-    from eitbench.report.page import failures
-    found = failures(store, records)
-    for failure in found:
-        options.echo(failure, err=True)
-    if found and any(job.isolation != "none" for job in asked):
-        options.echo(f"with --seeds {found[0].seeds[0]} --isolate none --jobs 1 the method runs in "
-                     "this process, where breakpoint() stops", err=True)

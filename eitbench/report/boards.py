@@ -18,7 +18,7 @@ import numpy as np
 import pandas as pd
 
 from eitbench._files import bundled_path
-from eitbench.bench import tracks
+from eitbench.bench import statistics, tracks
 from eitbench.bench.episode_table import read_episode_table, table_path
 from eitbench.bench.records import (
     finished_at,
@@ -28,16 +28,6 @@ from eitbench.bench.records import (
     version_number,
 )
 from eitbench.bench.scores import scores
-from eitbench.bench.statistics import (
-    Scores,
-    Statistic,
-    agent_name,
-    interquartile_mean,
-    mean_by_seed,
-    mean_over_environments,
-    shared_ranks,
-    stratified_bootstrap,
-)
 from eitbench.bench.text import scores_by_seed, seed_ranges
 from eitbench.bench.variants import flatten, format_setting
 from eitbench.scoring import normalised_score
@@ -117,7 +107,7 @@ class MethodRow(NamedTuple):
     @property
     def agent(self) -> str:
         """Key that the trainings of an agent share."""
-        name = agent_name(self.cells["method"])
+        name = statistics.agent_name(self.cells["method"])
         return self.label if name == self.cells["method"] else f"{name} {self.cells['official']}"
 
     @property
@@ -324,16 +314,17 @@ def _board(records: list[dict[str, Any]], known: Anchors, products: dict[str, fl
                        _with_ranks(rows, scores))
 
 
-def _with_ranks(rows: list[MethodRow], scores: Mapping[str, Scores], **options: Any,
+def _with_ranks(rows: list[MethodRow], scores: Mapping[str, statistics.Scores], **options: Any,
                 ) -> list[MethodRow]:
     """Return the rows with colours and, where they have scores, ranks. All trainings of an agent
     have the rank of their mean scores, and count as one method."""
-    trainings: dict[str, list[Scores]] = {}
+    trainings: dict[str, list[statistics.Scores]] = {}
     for row in rows:
         if row.label in scores:
             trainings.setdefault(row.agent, []).append(scores[row.label])
-    ranks = shared_ranks({agent: {
-        environment: mean_by_seed([own[environment] for own in each]) for environment in each[0]}
+    ranks = statistics.shared_ranks({
+        agent: {environment: statistics.mean_by_seed([own[environment] for own in each])
+                for environment in each[0]}
         for agent, each in trainings.items()}, **options)
     return [row._replace(cells=row.cells | {
         "rank": ranks[row.agent] if row.label in scores else None}, colour=i)
@@ -367,13 +358,13 @@ def _agent_mean(board: Leaderboard, rows: list[MethodRow]) -> MethodRow:
     for name in (*INTERVAL_HEADINGS, *headings()):
         values = [row.cells[name] for row in ranked if row.cells[name] is not None]
         cells[name] = float(np.mean(values)) if values else None
-    if errors := mean_by_seed([scores_by_seed(row.record) for row in ranked]):
+    if errors := statistics.mean_by_seed([scores_by_seed(row.record) for row in ranked]):
         cells |= _error_and_skill(errors, scores_by_seed(naive_baseline_record(board.records)))
     else:
         cells |= {"gain_low": None, "gain_high": None}
     versions = {row.cells["version"] for row in ranked}
     return ranked[0]._replace(record=None, trainings=tuple(rows), cells=cells | {
-        "method": agent_name(first["method"]),
+        "method": statistics.agent_name(first["method"]),
         "note": f"{unfinished} of {len(rows)} unfinished" if unfinished else "",
         "title": re.sub(r" trained with seed \d+$", "", first["title"]),
         "version": first["version"] if len(versions) == 1 else ""})
@@ -412,19 +403,20 @@ def skill_scores(zero: dict[str, float], errors: dict[str, float]) -> dict[str, 
 
 def _error_and_skill(errors: dict[str, float], zero: dict[str, float]) -> dict[str, float | None]:
     """Return mean error and interquartile mean skill score of one environment, with intervals."""
-    return (_with_interval("error", {"": errors}, mean_over_environments)
-            | _with_interval("gain", {"": skill_scores(zero, errors)}, interquartile_mean))
+    gains = skill_scores(zero, errors)
+    return (_with_interval("error", {"": errors}, statistics.mean_over_environments)
+            | _with_interval("gain", {"": gains}, statistics.interquartile_mean))
 
 
 def _with_interval(name: str, values: dict[str, dict[str, float]],
-                   statistic: Statistic) -> dict[str, float | None]:
+                   statistic: statistics.Statistic) -> dict[str, float | None]:
     """Return a statistic of environment -> seed -> score, ``name``, and the ends of its 95 %
     interval, ``name_low`` and ``name_high``; None where unknown."""
     three: Iterable[float | None] = (None, None, None)
     if all(values.values()):
         strata = {key: list(own.values()) for key, own in values.items()}
         three = (each if math.isfinite(each) else None
-                 for each in stratified_bootstrap(strata, statistic))
+                 for each in statistics.stratified_bootstrap(strata, statistic))
     return dict(zip((name, f"{name}_low", f"{name}_high"), three, strict=True))
 
 
@@ -463,12 +455,12 @@ def _aggregate(category: str, made: list[Leaderboard]) -> list[Leaderboard]:
         assert own[0].record is not None
         rows.append(MethodRow(
             dict.fromkeys(own[0].cells) | _identity_cells(own[0].record, ALL, note)
-            | _with_interval("gain", gains, interquartile_mean)
+            | _with_interval("gain", gains, statistics.interquartile_mean)
             | {"official": all(row.cells["official"] for row in own)}))
         if not note:
             competing[label] = gains
     ranked = _with_ranks(sorted(rows, key=MethodRow.place), competing,
-                         statistic=interquartile_mean, higher_is_better=True)
+                         statistic=statistics.interquartile_mean, higher_is_better=True)
     return [Leaderboard(category, ALL, "All environments", ranked)] if rows else []
 
 

@@ -11,17 +11,9 @@ import pandas as pd
 
 from eitbench import _check
 from eitbench._files import bundled_path, resolve_input
+from eitbench.bench import statistics
 from eitbench.bench.records import finished_at, read_record, read_records, split_outdated
 from eitbench.bench.scores import scores
-from eitbench.bench.statistics import (
-    Statistic,
-    agent_name,
-    interquartile_mean,
-    mean_by_seed,
-    mean_over_environments,
-    paired_difference,
-    paired_probability_of_improvement,
-)
 from eitbench.bench.table import MISSING, Cell, Table
 from eitbench.bench.text import format_interval, format_number, scores_by_seed
 from eitbench.bench.tracks import CATEGORIES, nominal_id, qualified_name
@@ -56,7 +48,7 @@ def find_records(name: str, folder: Path) -> list[dict[str, Any]]:
                if record["method"] == method and version in ("", record["version"])]
         if not version:
             own = [record for record in own if record["official"]] or own or mean_over_trainings(
-                [record for record in current if agent_name(record["method"]) == method])
+                [record for record in current if statistics.agent_name(record["method"]) == method])
         versions = sorted({f"{method}@{record['version']}" for record in own})
         if len(versions) > 1:
             raise ValueError(f"{name} fits several versions: {', '.join(versions)}")
@@ -74,13 +66,13 @@ def mean_over_trainings(records: list[dict[str, Any]]) -> list[dict[str, Any]]:
         groups.setdefault(_environment_and_split(record), []).append(record)
     means = []
     for trainings in groups.values():
-        found = {name: mean_by_seed([scores_by_seed(each, name) for each in trainings])
+        found = {name: statistics.mean_by_seed([scores_by_seed(each, name) for each in trainings])
                  for name in scores()}
         episodes = [{"seed": seed, "status": "ok", "scores": {
             name: own[seed] / scores()[name].factor for name, own in found.items() if seed in own}}
             for seed in found["error"]]
         means.append(trainings[0] | {
-            "method": agent_name(trainings[0]["method"]), "episodes": episodes,
+            "method": statistics.agent_name(trainings[0]["method"]), "episodes": episodes,
             "version": "mean over trainings"})
     return means
 
@@ -137,14 +129,14 @@ def compare(a: list[dict[str, Any]], b: list[dict[str, Any]], score: str = "erro
         raise ValueError(f"methods must share an environment and a seed that both finished with "
                          f"{score}; there are {', '.join(finished)}")
     higher = known[score] == "higher"
-    rows = [_row(label, score, {label: pair}, mean_over_environments, higher=higher)
+    rows = [_row(label, score, {label: pair}, statistics.mean_over_environments, higher=higher)
             for label, pair in pairs.items()]
     if score == "error":
         rows += [_row(f"all {kind} ({len(together)} environments)", SKILL_SCORE, together,
-                      interquartile_mean, higher=True)
+                      statistics.interquartile_mean, higher=True)
                  for kind, together in gains.items() if len(together) > 1]
     elif len(pairs) > 1:
-        rows.append(_row("all", score, pairs, mean_over_environments, higher=higher))
+        rows.append(_row("all", score, pairs, statistics.mean_over_environments, higher=higher))
     return pd.DataFrame(rows)
 
 
@@ -152,15 +144,15 @@ def _environment_and_split(record: dict[str, Any]) -> tuple[str, str]:
     return qualified_name(record["environment"]), record["split"]
 
 
-def _row(label: str, score: str, pairs: dict[str, Pair], statistic: Statistic, *,
+def _row(label: str, score: str, pairs: dict[str, Pair], statistic: statistics.Statistic, *,
          higher: bool) -> dict[str, Any]:
     """Return a row of `compare`; ``pairs`` are environment -> scores of a and b by seed."""
     ours, theirs = ({name: pair[side] for name, pair in pairs.items()} for side in (0, 1))
     a, b = (float(statistic(*[list(own.values()) for own in side.values()]))
             for side in (ours, theirs))
-    difference = paired_difference(*((ours, theirs) if higher else (theirs, ours)),
+    difference = statistics.paired_difference(*((ours, theirs) if higher else (theirs, ours)),
                                    statistic=statistic)
-    better = paired_probability_of_improvement(ours, theirs, higher_is_better=higher)
+    better = statistics.paired_probability_of_improvement(ours, theirs, higher_is_better=higher)
     return {"environment": label, "score": score, "episodes": sum(map(len, ours.values())),
             "a": a, "b": b,
             **dict(zip(("advantage", "low", "high"), difference, strict=True)),
