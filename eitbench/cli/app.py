@@ -22,7 +22,7 @@ Quick start:  eitbench run  — runs the built-in estimators on four test episod
 table, writes results/index.html.
 """)
 
-command = partial(app.command, cls=options.SingleValueCommand)
+command = partial(app.command, cls=options.Command)
 
 
 def _print_version(asked: bool) -> None:
@@ -102,18 +102,17 @@ def submit(
     from eitbench.bench.store import EpisodeStore
     from eitbench.bench.submit import submit
     from eitbench.bench.text import describe_scores, episodes_worse_than_homogeneous
-    with options.cli_errors():
-        if baseline and policy:
-            raise ValueError("one of --baseline and --policy may be given, got both")
-        seeds_asked = options.parse_episodes(seeds)
-        for path in submit(baseline or policy, env or [], seeds_asked, EpisodeStore(out), to,
-                           policy=policy is not None, official=official, isolate=isolate,
-                           n_jobs=jobs, backend=backend, command=command_line()):
-            record = read_record(path)
-            options.echo(f"wrote {path}: {describe_scores(record)}")
-            if worse := episodes_worse_than_homogeneous(record):
-                options.echo("warning: ẽ_c is larger than for the homogeneous estimate in "
-                             f"{worse}; the method may have diverged", err=True)
+    if baseline and policy:
+        raise ValueError("one of --baseline and --policy may be given, got both")
+    seeds_asked = options.parse_episodes(seeds)
+    for path in submit(baseline or policy, env or [], seeds_asked, EpisodeStore(out), to,
+                       policy=policy is not None, official=official, isolate=isolate,
+                       n_jobs=jobs, backend=backend, command=command_line()):
+        record = read_record(path)
+        options.echo(f"wrote {path}: {describe_scores(record)}")
+        if worse := episodes_worse_than_homogeneous(record):
+            options.echo("warning: ẽ_c is larger than for the homogeneous estimate in "
+                         f"{worse}; the method may have diverged", err=True)
 
 
 command()(verify)
@@ -133,12 +132,11 @@ def golden(
     """
     from eitbench.bench import golden
     any_moved = False
-    with options.cli_errors():
-        for name, status, differences in golden.update(names or [], new_version=new_version):
-            any_moved |= status == "moved"
-            options.echo(f"{name}: {status}")
-            for difference in differences:
-                options.echo(f"  {difference}", err=status == "moved")
+    for name, status, differences in golden.update(names or [], new_version=new_version):
+        any_moved |= status == "moved"
+        options.echo(f"{name}: {status}")
+        for difference in differences:
+            options.echo(f"  {difference}", err=status == "moved")
     if any_moved:
         options.echo("numbers have changed: find the cause; or give the world the next -vN, or "
                     "write the method's next version with --new-version and rerun its records",
@@ -165,19 +163,17 @@ def leaderboard(
     written. --env imports the module of a user-defined environment.
     """
     if records is None:
-        with options.cli_errors():
-            return print_report(out)
+        return print_report(out)
     from eitbench._files import write_atomically
     from eitbench.bench.episode_table import table_path, write_episode_table
     from eitbench.report.boards import read_leaderboard_records
     from eitbench.report.site import collect, render, render_site, write_site
-    with options.cli_errors():
-        found, complaints = read_leaderboard_records(records)
-        out = records.parent
-        site = collect([record for record in found if record["split"] == "test"], out)
-        complaints += site.measured.errors
-        texts = render(site)
-        write_site(out / "site", render_site(site))
+    found, complaints = read_leaderboard_records(records)
+    out = records.parent
+    site = collect([record for record in found if record["split"] == "test"], out)
+    complaints += site.measured.errors
+    texts = render(site)
+    write_site(out / "site", render_site(site))
     for name, text in texts.items():
         write_atomically(out / name, text.encode())
         options.echo(f"wrote {out / name}")
@@ -203,10 +199,9 @@ def compare(
     which A is better. The errors of several environments are aggregated as skill scores,
     without shifted environments."""
     from eitbench.report import compare as comparison
-    with options.cli_errors():
-        ours, theirs = ([record for record in comparison.find_records(name, records)
-                         if not env or record["environment"]["id"] in env] for name in (a, b))
-        table = comparison.compare(ours, theirs, score, comparison.naive_baseline_records(records))
+    ours, theirs = ([record for record in comparison.find_records(name, records)
+                     if not env or record["environment"]["id"] in env] for name in (a, b))
+    table = comparison.compare(ours, theirs, score, comparison.naive_baseline_records(records))
     width = options.table_width()
     options.echo(comparison.format_comparison(table, ours[0], theirs[0], score, width))
 
@@ -228,12 +223,11 @@ def render(
     """Draw an episode: ground truth, estimates, electrodes, standard deviation of one estimate."""
     from eitbench.bench.tracks import track_of
     from eitbench.report.animate import animate
-    with options.cli_errors():
-        if track_of(env) == "injection" and policy is None:
-            raise ValueError(f"policy must be given for {env}, an injection environment")
-        animate(env, [policy] if policy else baseline or ["kalman_filter"], seed, step, out,
-                every=every, isolate=isolate)
-        options.echo(f"wrote {out}")
+    if track_of(env) == "injection" and policy is None:
+        raise ValueError(f"policy must be given for {env}, an injection environment")
+    animate(env, [policy] if policy else baseline or ["kalman_filter"], seed, step, out,
+            every=every, isolate=isolate)
+    options.echo(f"wrote {out}")
 
 
 REPLACED = {

@@ -51,42 +51,41 @@ def estimate(
     from eitbench.measured import read
     from eitbench.measured.segmentation import read_truth, require_round_tank
     from eitbench.report.measured import write_report
-    with options.cli_errors():
-        if out.suffix != ".html":
-            raise ValueError(f"--out must end in .html, got {out}")
-        measurements = read(file, format, None if span is None else _steps(span),
-                            **_reader_options(option or []))
-        T, M = measurements.voltages.shape
-        options.echo(f"{file}: {T} × {M} measurements, {measurements.currents.shape[1]} "
-                    f"electrodes; a method takes about {10 + 0.03 * T:.0f} s")
-        env = MeasuredEnv(measurements, vessel, withheld=withheld, moves=False if still else None,
-                          correction=correction, homogeneous_frames=homogeneous_frames)
-        mask = None if truth is None else read_truth(truth)
+    if out.suffix != ".html":
+        raise ValueError(f"--out must end in .html, got {out}")
+    measurements = read(file, format, None if span is None else _steps(span),
+                        **_reader_options(option or []))
+    T, M = measurements.voltages.shape
+    options.echo(f"{file}: {T} × {M} measurements, {measurements.currents.shape[1]} "
+                f"electrodes; a method takes about {10 + 0.03 * T:.0f} s")
+    env = MeasuredEnv(measurements, vessel, withheld=withheld, moves=False if still else None,
+                      correction=correction, homogeneous_frames=homogeneous_frames)
+    mask = None if truth is None else read_truth(truth)
+    if mask is not None:
+        require_round_tank(env.vessel)
+    for warning in env.quality_warnings():
+        options.echo(f"warning: {warning}", err=True)
+    runs, kept = [], plotted_steps(env) if arrays is None else None
+    for name in baseline:
+        try:
+            run = run_on_measurements(env, name, seed, kept=kept)
+        except Exception as error:
+            raise ValueError(f"{name} failed: {type(error).__name__}: {error}") from error
+        runs.append(run)
+        score = ("no measurement is withheld, so nothing is scored" if not env.withheld
+                 else f"withheld RMSE {run.withheld_rmse:.2f} noise std, "
+                      f"{1e3 * run.withheld_rmse_volts:.3g} mV")
+        options.echo(f"{run.method}: {score}")
+        if run.velocity is not None:
+            velocity = ", ".join(f"{each:.3g}" for each in run.velocity[-1])
+            options.echo(f"  mean velocity at the end {velocity} m/s")
         if mask is not None:
-            require_round_tank(env.vessel)
-        for warning in env.quality_warnings():
-            options.echo(f"warning: {warning}", err=True)
-        runs, kept = [], plotted_steps(env) if arrays is None else None
-        for name in baseline:
-            try:
-                run = run_on_measurements(env, name, seed, kept=kept)
-            except Exception as error:
-                raise ValueError(f"{name} failed: {type(error).__name__}: {error}") from error
-            runs.append(run)
-            score = ("no measurement is withheld, so nothing is scored" if not env.withheld
-                     else f"withheld RMSE {run.withheld_rmse:.2f} noise std, "
-                          f"{1e3 * run.withheld_rmse_volts:.3g} mV")
-            options.echo(f"{run.method}: {score}")
-            if run.velocity is not None:
-                velocity = ", ".join(f"{each:.3g}" for each in run.velocity[-1])
-                options.echo(f"  mean velocity at the end {velocity} m/s")
-            if mask is not None:
-                options.echo(f"  {_truth_scores(env, run, mask)}")
-        write_report(out, env, runs, mask)
-        options.echo(f"wrote {out}")
-        if arrays is not None:
-            runs[0].save(arrays, env)
-            options.echo(f"wrote {arrays}")
+            options.echo(f"  {_truth_scores(env, run, mask)}")
+    write_report(out, env, runs, mask)
+    options.echo(f"wrote {out}")
+    if arrays is not None:
+        runs[0].save(arrays, env)
+        options.echo(f"wrote {arrays}")
 
 
 def fetch(
@@ -95,12 +94,11 @@ def fetch(
 ) -> None:
     """Download the public measurements of cases, and check their sha256."""
     from eitbench.measured.cases import download_case, measured_folder, read_case
-    with options.cli_errors():
-        for case in [read_case(name) for name in cases]:
-            options.echo(f"{case.name}: {case.title} (licence: {case.licence})")
-            for path in download_case(case):
-                options.echo(f"  wrote {path}")
-            options.echo(f"  complete in {measured_folder()}")
+    for case in [read_case(name) for name in cases]:
+        options.echo(f"{case.name}: {case.title} (licence: {case.licence})")
+        for path in download_case(case):
+            options.echo(f"  wrote {path}")
+        options.echo(f"  complete in {measured_folder()}")
 
 
 def _reader_options(texts: list[str]) -> dict[str, float | str]:

@@ -34,22 +34,21 @@ def bank(
     from eitbench.data.presimulation import cached_episode_bytes, missing_seeds, presimulate
     from eitbench.data.seeds import parse_seeds
     from eitbench.worlds.registry import entry
-    with options.cli_errors():
-        numbers = parse_seeds(seeds)
-        world = entry(env).world
-        place, size = folder(world), cached_episode_bytes(world)
-        try:
-            place.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise ValueError(f"episodes cannot be stored in {place}: {error}") from error
-        missing = len(missing_seeds(world, numbers))
-        options.echo(f"{len(numbers)} episodes, {len(numbers) * size / 1e6:.0f} MB in {place}; "
-                     f"{missing} to simulate")
-        free = shutil.disk_usage(place).free
-        if missing * size > free:
-            raise ValueError(f"seeds need {missing * size / 1e9:.1f} GB more, and "
-                             f"{free / 1e9:.1f} GB are free")
-        made = presimulate(world, numbers, n_jobs=jobs, backend=backend)
+    numbers = parse_seeds(seeds)
+    world = entry(env).world
+    place, size = folder(world), cached_episode_bytes(world)
+    try:
+        place.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ValueError(f"episodes cannot be stored in {place}: {error}") from error
+    missing = len(missing_seeds(world, numbers))
+    options.echo(f"{len(numbers)} episodes, {len(numbers) * size / 1e6:.0f} MB in {place}; "
+                 f"{missing} to simulate")
+    free = shutil.disk_usage(place).free
+    if missing * size > free:
+        raise ValueError(f"seeds need {missing * size / 1e9:.1f} GB more, and "
+                         f"{free / 1e9:.1f} GB are free")
+    made = presimulate(world, numbers, n_jobs=jobs, backend=backend)
     options.echo(f"{made} simulated, {len(numbers) - made} were already stored")
 
 
@@ -74,20 +73,19 @@ def export(
     end and cannot be resumed.
     """
     import eitbench
-    with options.cli_errors():
-        if (policy is not None) != (format is Format.minari):
-            raise ValueError("policy must be given with format minari, and with no other; got "
-                             f"policy {policy} and format {format.value}")
-        if policy is not None:
-            from eitbench.bench.minari_export import export_minari
-            written = export_minari(out, env, policy, seeds, n_jobs=jobs, backend=backend)
-            options.echo(f"{written} episodes written; minari.load_dataset({out!r}) reads them")
-        else:
-            from eitbench.data.export import export as export_files
-            examples = eitbench.dataset(env, seeds)
-            written = export_files(examples, Path(out), format.value, n_jobs=jobs, backend=backend)
-            options.echo(f"{written} episodes written to {out}, {len(examples) - written} were "
-                        "already stored")
+    if (policy is not None) != (format is Format.minari):
+        raise ValueError("policy must be given with format minari, and with no other; got "
+                         f"policy {policy} and format {format.value}")
+    if policy is not None:
+        from eitbench.bench.minari_export import export_minari
+        written = export_minari(out, env, policy, seeds, n_jobs=jobs, backend=backend)
+        options.echo(f"{written} episodes written; minari.load_dataset({out!r}) reads them")
+    else:
+        from eitbench.data.export import export as export_files
+        examples = eitbench.dataset(env, seeds)
+        written = export_files(examples, Path(out), format.value, n_jobs=jobs, backend=backend)
+        options.echo(f"{written} episodes written to {out}, {len(examples) - written} were "
+                    "already stored")
 
 
 def train(
@@ -113,15 +111,15 @@ def train(
     from dataclasses import replace
 
     import numpy as np
-    with options.cli_errors():
-        from eitbench.rl import training
-        asked = training.read_config(config)
-        if steps is not None:
-            asked = replace(asked, total_steps=steps)
-        folder = out or Path("results/training") / env.replace("/", "-") / algo / f"seed{seed}"
-        options.echo(f"{asked.total_steps} steps of {algo.value}, configured by {config}, with "
-                     f"evaluations every {asked.interval} steps, in {folder}")
-        model = training.train(env, algo.value, asked, seed, folder)
+
+    from eitbench.rl import training
+    asked = training.read_config(config)
+    if steps is not None:
+        asked = replace(asked, total_steps=steps)
+    folder = out or Path("results/training") / env.replace("/", "-") / algo / f"seed{seed}"
+    options.echo(f"{asked.total_steps} steps of {algo.value}, configured by {config}, with "
+                 f"evaluations every {asked.interval} steps, in {folder}")
+    model = training.train(env, algo.value, asked, seed, folder)
     last = {name: values[-1] for name, values in np.load(folder / "evaluations.npz").items()}
     options.echo(f"wrote {model}: ẽ_c {last['errors'].mean():.3g}, return "
                  f"{last['results'].mean():.3g} in {len(last['errors'])} dev episodes, with the "
@@ -130,7 +128,7 @@ def train(
                  "--seeds dev:0-15")
 
 
-@fit.command("prior", cls=options.SingleValueCommand)
+@fit.command("prior", cls=options.Command)
 def fit_prior(
     env: options.EnvironmentId,
     out: Annotated[Path, typer.Option("--out", "-o", help="File to write, JSON.")],
@@ -154,11 +152,10 @@ def fit_prior(
     source: dict[str, Any] = {"environment": env, "seeds": seeds, "nugget": nugget, "kept": kept}
     if quiet is not None:
         source["quiet"] = quiet
-    with options.cli_errors():
-        prior = fit_prior_from_episodes(
-            entry(env).world, parse_seeds(seeds), link=link.value, nugget=nugget,
-            variance_cutoff=kept, quiet_threshold=quiet, source=source)
-        prior.save(out)
+    prior = fit_prior_from_episodes(
+        entry(env).world, parse_seeds(seeds), link=link.value, nugget=nugget,
+        variance_cutoff=kept, quiet_threshold=quiet, source=source)
+    prior.save(out)
     options.echo(f"{out}: {prior.modes.shape[1]} modes across {len(prior.points)} nodes of the "
                 f"inlet, correlated over {prior.correlation_steps} steps of {prior.time_step:g} s")
     if prior.regimes is not None:
@@ -166,7 +163,7 @@ def fit_prior(
                     f"{1.0 / prior.regimes.p_end:.1f} steps on average")
 
 
-@fit.command("model", cls=options.SingleValueCommand)
+@fit.command("model", cls=options.Command)
 def fit_model(
     env: options.EnvironmentId,
     out: Annotated[Path, typer.Option("--out", "-o", help="File to write, npz.")],
@@ -188,14 +185,13 @@ def fit_model(
     import eitbench
     from eitbench.estimation import identify_model
     from eitbench.measured.quality import percent
-    with options.cli_errors():
-        examples = eitbench.dataset(env, seeds)
-        model = identify_model(
-            examples, modes=modes, residual_only=correct, linearised=linearised,
-            progress=lambda each: tqdm(each, desc="learning", unit="episode", disable=None),
-            source={"environment": env, "seeds": seeds, "modes": modes}
-            | dict.fromkeys(["correct"] * correct + ["linearised"] * linearised, True))
-        model.save(out)
+    examples = eitbench.dataset(env, seeds)
+    model = identify_model(
+        examples, modes=modes, residual_only=correct, linearised=linearised,
+        progress=lambda each: tqdm(each, desc="learning", unit="episode", disable=None),
+        source={"environment": env, "seeds": seeds, "modes": modes}
+        | dict.fromkeys(["correct"] * correct + ["linearised"] * linearised, True))
+    model.save(out)
     left = float(model.residual_covariance.trace() / examples.mass.sum())
     options.echo(f"{out}: {modes} modes of the concentration, impulse response of "
                 f"{model.impulse_response.shape[1]} steps; root mean square residual "

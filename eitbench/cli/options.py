@@ -7,8 +7,6 @@ import os
 import shutil
 import sys
 from collections import Counter
-from collections.abc import Iterator
-from contextlib import contextmanager
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated, Any
@@ -27,8 +25,9 @@ Backend = StrEnum("Backend", ["loky", "ray", "dask"])
 Isolation = StrEnum("Isolation", ["auto", "none", "process", "bubblewrap"])
 
 
-class SingleValueCommand(TyperCommand):
-    """A command that refuses a second value of an option with one: the last would replace it."""
+class Command(TyperCommand):
+    """A command that refuses a second value of an option with one, which would replace the first,
+    and reports errors of users without a traceback."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         *_, order = self.make_parser(ctx).parse_args(args=list(args))
@@ -36,6 +35,26 @@ class SingleValueCommand(TyperCommand):
             if count > 1 and option.param_type_name == "option" and not option.multiple:
                 ctx.fail(f"{option.opts[0]} may be given once, got {count} times")
         return super().parse_args(ctx, args)
+
+    def invoke(self, ctx: Any) -> Any:
+        """Run the command; convert a ValueError about an argument, the loss of a process, an error
+        in a worker, or a missing extra to a message."""
+        try:
+            return super().invoke(ctx)
+        except RuntimeError as error:
+            from eitbench.bench.isolation import WorkerError
+            if not isinstance(error, WorkerLostError | WorkerError):
+                raise
+            echo(error, err=True)  # a traceback would print third-party text unsanitised
+            raise typer.Exit(1) from error
+        except ModuleNotFoundError as error:
+            if (sentence := missing_extra("this command", error)) is None:
+                raise
+            echo(sentence, err=True)
+            raise typer.Exit(1) from error
+        except ValueError as error:
+            echo(f"error: {error}", err=True)    # not in a box, which would break paths
+            raise typer.Exit(2) from error
 
 
 def resolve_path(path: Path | None) -> Path | None:
@@ -105,25 +124,3 @@ def parse_episodes(seeds: str | None) -> list[int] | None:
 def echo(text: object, *, err: bool = False) -> None:
     """Print text that may contain third-party text, without control characters."""
     typer.echo(sanitize(str(text), lines=True), err=err)
-
-
-@contextmanager
-def cli_errors() -> Iterator[None]:
-    """Convert a ValueError about an argument, the loss of a process, an error in a worker, or a
-    missing extra to a message without a traceback."""
-    try:
-        yield
-    except RuntimeError as error:
-        from eitbench.bench.isolation import WorkerError
-        if not isinstance(error, WorkerLostError | WorkerError):
-            raise
-        echo(error, err=True)  # a traceback would print third-party text unsanitised
-        raise typer.Exit(1) from error
-    except ModuleNotFoundError as error:
-        if (sentence := missing_extra("this command", error)) is None:
-            raise
-        echo(sentence, err=True)
-        raise typer.Exit(1) from error
-    except ValueError as error:
-        echo(f"error: {error}", err=True)    # not in a box, which would break paths
-        raise typer.Exit(2) from error

@@ -61,23 +61,22 @@ def run(
     from eitbench.bench.run import make_jobs, pending_jobs, run_jobs, successful_results
     from eitbench.bench.store import EpisodeStore, folder_results
     from eitbench.bench.variants import variants
-    with options.cli_errors():
-        track = _track_of(env or [], baseline, policy)
-        if records is not None and not records.is_dir():
-            raise ValueError(f"--records must be a folder, got {records}")
-        worlds = variants(settings or [])
-        todo = make_jobs(track, env or [], (baseline or policy or []),
-                         options.parse_episodes(seeds), suite=suite, estimator=estimator,
-                         isolate=isolate, worlds=worlds)
-        before = folder_results(records) if records else []
-        store = EpisodeStore(out)
-        run_jobs(pending_jobs(todo, before), store, n_jobs=jobs, backend=backend,
-                 command=command_line())
-        print_report(out, todo, worlds, before)
-        done = {job.method for job in successful_results(todo, [*before, *store.results()])}
-        if lost := dict.fromkeys(job.load().name for job in todo if job.method not in done):
-            options.echo(f"all episodes failed for {', '.join(lost)}", err=True)
-            raise typer.Exit(1)
+    track = _track_of(env or [], baseline, policy)
+    if records is not None and not records.is_dir():
+        raise ValueError(f"--records must be a folder, got {records}")
+    worlds = variants(settings or [])
+    todo = make_jobs(track, env or [], (baseline or policy or []),
+                     options.parse_episodes(seeds), suite=suite, estimator=estimator,
+                     isolate=isolate, worlds=worlds)
+    before = folder_results(records) if records else []
+    store = EpisodeStore(out)
+    run_jobs(pending_jobs(todo, before), store, n_jobs=jobs, backend=backend,
+             command=command_line())
+    print_report(out, todo, worlds, before)
+    done = {job.method for job in successful_results(todo, [*before, *store.results()])}
+    if lost := dict.fromkeys(job.load().name for job in todo if job.method not in done):
+        options.echo(f"all episodes failed for {', '.join(lost)}", err=True)
+        raise typer.Exit(1)
 
 
 def _track_of(env: list[str], baseline: list[str] | None, policy: list[str] | None) -> str:

@@ -56,12 +56,11 @@ def verify(
 
     from eitbench.bench.held_out import read_secret
     from eitbench.bench.verify import select_records
-    with options.cli_errors():
-        _check_arguments(paths or [], every, top, episodes, held_out, secret, method)
-        key = read_secret(secret) if secret else b""
-        chosen = paths or select_records(records, env or [], top=top)
-        if missing := [str(path) for path in chosen if not path.is_file()]:
-            raise ValueError(f"records must be files, got {', '.join(missing)}")
+    _check_arguments(paths or [], every, top, episodes, held_out, secret, method)
+    key = read_secret(secret) if secret else b""
+    chosen = paths or select_records(records, env or [], top=top)
+    if missing := [str(path) for path in chosen if not path.is_file()]:
+        raise ValueError(f"records must be files, got {', '.join(missing)}")
     if every and out is None:
         out = Path("results/verify")
     drawn = 0 if every and seed is None else secrets.randbelow(2**32) if seed is None else seed
@@ -98,8 +97,7 @@ def _rerun(paths: list[Path], folder: Path, tolerance: float, episodes: int, see
            how: dict[str, Any]) -> list[str]:
     """Print the table of reruns and return the problems."""
     from eitbench.bench import verify as verification
-    with options.cli_errors():
-        rows = verification.verify(paths, folder, episodes=episodes, seed=seed, **how)
+    rows = verification.verify(paths, folder, episodes=episodes, seed=seed, **how)
     table = verification.verification_table(rows, tolerance)
     options.echo(f"episodes drawn with --seed {seed}\n\n{table}\n")
     for note in dict.fromkeys(filter(None, rows["note"])):
