@@ -13,11 +13,11 @@ import json
 import math
 import re
 import warnings
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from functools import lru_cache
 from itertools import filterfalse, islice
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import jsonschema_rs
 import orjson
@@ -39,6 +39,7 @@ MAX_RECORD_DEPTH = 32
 MAX_KWARGS_CHARS = 10_000
 """length of an environment's arguments as JSON, which become headings"""
 _BUILTIN_VERSION = re.compile(r"v([1-9][0-9]*)")
+Item = TypeVar("Item")
 
 
 # -- files --------------------------------------------------------------------------------------
@@ -168,6 +169,14 @@ def _json(value: Any, **how: Any) -> str:
 # -- several records ----------------------------------------------------------------------------
 
 
+def group_by(items: Iterable[Item], key: Callable[[Item], Any]) -> dict[Any, list[Item]]:
+    """Return key -> items with this key, both in the given order."""
+    groups: dict[Any, list[Item]] = {}
+    for item in items:
+        groups.setdefault(key(item), []).append(item)
+    return groups
+
+
 def split_of(seed: str) -> str:
     """Return ``test`` for ``test:4``, and ``own`` for a plain number."""
     return seed.split(":")[0] if ":" in seed else "own"
@@ -183,15 +192,19 @@ def finished_at(record: dict[str, Any]) -> str:
     return max(episode["finished"] for episode in record["episodes"])
 
 
+def precedence(record: dict[str, Any]) -> tuple[bool, str]:
+    """Return the key with which `max` chooses among records: an official one, then the latest."""
+    return record["official"], finished_at(record)
+
+
 def group_runs(runs: Iterable[dict[str, Any]], *keys: str) -> list[list[dict[str, Any]]]:
     """Group runs by code, ``keys`` and machine, without the time of the matrix product."""
-    groups: dict[str, list[dict[str, Any]]] = {}
-    for run in runs:
+    def same(run: dict[str, Any]) -> str:
         machine = {key: value for key, value in run["machine"].items() if key != "matmul_seconds"}
         code = ("commit", "dirty", "source", "versions", "blas")
-        same = [machine, *(run.get(key) for key in (*code, *keys))]
-        groups.setdefault(_json(same), []).append(run)
-    return list(groups.values())
+        return _json([machine, *(run.get(key) for key in (*code, *keys))])
+
+    return list(group_by(runs, same).values())
 
 
 def split_outdated(records: list[dict[str, Any]],

@@ -108,7 +108,7 @@ class EpisodeStore:
         most recent result. ``also`` are results of other records, which replace missing and failed
         episodes of the same version of the method.
         """
-        own, others = _by_record(self.results()), _by_record(also)
+        own, others = (stored.group_by(each, _record_key) for each in (self.results(), also))
         records = []
         for key in dict.fromkeys([*own, *others]):
             fresh = own.get(key, [])
@@ -137,14 +137,9 @@ class EpisodeStore:
         return self.folder / "episodes" / environment.replace("/", "-") / method / name
 
 
-def _by_record(results: Iterable[dict[str, Any]],
-               ) -> dict[tuple[str, str, str], list[dict[str, Any]]]:
-    """Group results by environment, method and split, as in records."""
-    groups: dict[tuple[str, str, str], list[dict[str, Any]]] = {}
-    for result in results:
-        key = (result["environment"]["name"], result["method"], stored.split_of(result["seed"]))
-        groups.setdefault(key, []).append(result)
-    return groups
+def _record_key(result: dict[str, Any]) -> tuple[str, str, str]:
+    """Return environment, method and split, which all results of a record share."""
+    return result["environment"]["name"], result["method"], stored.split_of(result["seed"])
 
 
 def _latest(results: list[dict[str, Any]]) -> dict[str, Any]:

@@ -106,14 +106,13 @@ def select_records(folder: Path, environments: Sequence[str] = (), *, top: int =
 
 def _first(records: list[dict[str, Any]], count: int) -> list[dict[str, Any]]:
     """Return the ``count`` best ranked records of each environment."""
-    groups: dict[str, list[tuple[float, str, dict[str, Any]]]] = {}
-    for record in records:
-        errors = list(scores_by_seed(record, "error").values())
-        is_ranked = record["role"] is None and not record["privileged"]
-        if is_ranked and len(errors) == len(record["episodes"]):
-            groups.setdefault(record["environment"]["name"], []).append(
-                (float(np.mean(errors)), record_file_name(record), record))
-    return [record for group in groups.values() for *_, record in sorted(group)[:count]]
+    def place(record: dict[str, Any]) -> tuple[float, str]:
+        return float(np.mean(list(scores_by_seed(record).values()))), record_file_name(record)
+
+    ranked = [record for record in records if record["role"] is None and not record["privileged"]
+              and len(scores_by_seed(record)) == len(record["episodes"])]
+    groups = stored.group_by(ranked, lambda record: record["environment"]["name"])
+    return [record for group in groups.values() for record in sorted(group, key=place)[:count]]
 
 
 # -- the method of a record ---------------------------------------------------------------------
@@ -182,10 +181,7 @@ def _reruns(cases: list[Case], folder: Path, n_jobs: int, backend: str,
     """Run the episodes that are not stored in the folder; yield all with their new results.
     Versions of a method have separate stores, as third-party methods may share a name; so have
     kinds of isolation."""
-    places: dict[Path, list[Case]] = {}
-    for record, episode, job in cases:
-        place = folder / job.isolation / record["version"]
-        places.setdefault(place, []).append((record, episode, job))
+    places = stored.group_by(cases, lambda case: folder / case[2].isolation / case[0]["version"])
     for place, own in places.items():
         store = EpisodeStore(place)
         run_jobs([job for *_, job in own], store, n_jobs=n_jobs, backend=backend,

@@ -18,15 +18,9 @@ import numpy as np
 import pandas as pd
 
 from eitbench._files import bundled_path
+from eitbench.bench import records as stored
 from eitbench.bench import statistics, tracks
 from eitbench.bench.episode_table import read_episode_table, table_path
-from eitbench.bench.records import (
-    finished_at,
-    read_valid_files,
-    record_file_name,
-    split_outdated,
-    version_number,
-)
 from eitbench.bench.scores import scores
 from eitbench.bench.text import scores_by_seed, seed_ranges
 from eitbench.bench.variants import flatten, format_setting
@@ -102,7 +96,7 @@ class MethodRow(NamedTuple):
     @property
     def is_builtin(self) -> bool:
         """True for a built-in method, whose versions are numbered; false for a user's file."""
-        return version_number(self.cells["version"]) is not None
+        return stored.version_number(self.cells["version"]) is not None
 
     @property
     def agent(self) -> str:
@@ -162,9 +156,7 @@ class Leaderboard(NamedTuple):
         Agents with at least two ranked training seeds become one row: the mean over these seeds,
         with the interval over the episodes of the seeds' mean scores.
         """
-        groups: dict[str, list[MethodRow]] = {}
-        for row in self.rows:
-            groups.setdefault(row.label if row.has_no_rank else row.agent, []).append(row)
+        groups = stored.group_by(self.rows, lambda row: row.label if row.has_no_rank else row.agent)
         grouped = ([_agent_mean(self, rows)] if sum(row.is_ranked for row in rows) > 1 else rows
                    for rows in groups.values())
         return sorted(chain(*grouped), key=MethodRow.place)
@@ -266,8 +258,8 @@ def leaderboards(records: list[dict[str, Any]]) -> list[Leaderboard]:
     """
     if other := next((record for record in records if record["split"] != "test"), None):
         raise ValueError("leaderboards are made of test seeds; "
-                         f"{record_file_name(other)} has {other['split']} seeds")
-    current, _ = split_outdated(records)
+                         f"{stored.record_file_name(other)} has {other['split']} seeds")
+    current, _ = stored.split_outdated(records)
     made = _boards(current, anchors(current), ranked=True)
     found: list[Leaderboard] = []
     for name in tracks.CATEGORIES:
@@ -288,13 +280,14 @@ def _boards(records: list[dict[str, Any]], known: Anchors, *, ranked: bool) -> l
     """Return a board for each split and environment, in the order of registration."""
     products = _matmul_seconds(records)
     kinds = [base_environment(id) for id in tracks.ids()]
-    groups: dict[tuple[Any, ...], list[dict[str, Any]]] = {}
-    for record in records:
+
+    def place(record: dict[str, Any]) -> tuple[Any, ...]:
         kind = base_environment(record["environment"]["id"])
-        place = kinds.index(kind) if kind in kinds else len(kinds)
-        key = (SPLIT_ORDER.index(record["split"]), place, world_key(record),
-               record["environment"]["name"], record_category(record))
-        groups.setdefault(key, []).append(record)
+        return (SPLIT_ORDER.index(record["split"]),
+                kinds.index(kind) if kind in kinds else len(kinds), world_key(record),
+                record["environment"]["name"], record_category(record))
+
+    groups = stored.group_by(records, place)
     return [_board(groups[key], known, products, ranked=ranked) for key in sorted(groups)]
 
 
@@ -318,14 +311,10 @@ def _with_ranks(rows: list[MethodRow], scores: Mapping[str, statistics.Scores], 
                 ) -> list[MethodRow]:
     """Return the rows with colours and, where they have scores, ranks. All trainings of an agent
     have the rank of their mean scores, and count as one method."""
-    trainings: dict[str, list[statistics.Scores]] = {}
-    for row in rows:
-        if row.label in scores:
-            trainings.setdefault(row.agent, []).append(scores[row.label])
-    ranks = statistics.shared_ranks({
-        agent: {environment: statistics.mean_by_seed([own[environment] for own in each])
-                for environment in each[0]}
-        for agent, each in trainings.items()}, **options)
+    trainings = stored.group_by((row for row in rows if row.label in scores), lambda row: row.agent)
+    ranks = statistics.shared_ranks({agent: {
+        environment: statistics.mean_by_seed([scores[row.label][environment] for row in each])
+        for environment in scores[each[0].label]} for agent, each in trainings.items()}, **options)
     return [row._replace(cells=row.cells | {
         "rank": ranks[row.agent] if row.label in scores else None}, colour=i)
         for i, row in enumerate(rows)]
@@ -385,15 +374,14 @@ def _identity_cells(record: dict[str, Any], environment: str, note: str) -> dict
 
 def naive_baseline_record(records: Iterable[dict[str, Any]]) -> dict[str, Any] | None:
     """Return the naive baseline among the records of one environment, if any; official first."""
-    return max(filter(is_naive_baseline, records), default=None,
-               key=lambda record: (record["official"], finished_at(record)))
+    return max(filter(is_naive_baseline, records), default=None, key=stored.precedence)
 
 
 def is_naive_baseline(record: dict[str, Any]) -> bool:
     """Return True for a record of the built-in naive baseline (its version is a number)."""
     track = "injection" if record["board"] == "injection" else "estimation"
     return (record["method"] == tracks.NAIVE_BASELINES[track]
-            and version_number(record["version"]) is not None)
+            and stored.version_number(record["version"]) is not None)
 
 
 def skill_scores(zero: dict[str, float], errors: dict[str, float]) -> dict[str, float]:
@@ -470,7 +458,7 @@ def _aggregate(category: str, made: list[Leaderboard]) -> list[Leaderboard]:
 def read_leaderboard_records(folder: Path) -> tuple[list[dict[str, Any]], list[str]]:
     """Return the records of a folder, and one message for each record that leaderboards leave out,
     since it is invalid or has other seeds than test. ``ValueError`` if no other record exists."""
-    read, complaints = read_valid_files(folder)
+    read, complaints = stored.read_valid_files(folder)
     complaints += [f"record {path} has {record['split']} seeds, and leaderboards are made of test "
                    "seeds" for path, record in read.items() if record["split"] != "test"]
     if all(record["split"] != "test" for record in read.values()):
@@ -489,10 +477,11 @@ def anchors(records: Iterable[dict[str, Any]]) -> Anchors:
     found: dict[tuple[str, str, str], dict[str, Any]] = {}
     for record in records:
         # a third-party method with this name does not count
-        if record["method"] in SKILL_ANCHORS and version_number(record.get("version", "v1")):
+        if record["method"] in SKILL_ANCHORS and stored.version_number(record.get("version", "v1")):
             key = (record["method"], world_key(record), record["split"])
             found[key] = max(found.get(key, record), record, key=lambda other: (
-                other["official"], tracks.ALL_SUBTRACKS.index(other["board"]), finished_at(other)))
+                other["official"], tracks.ALL_SUBTRACKS.index(other["board"]),
+                stored.finished_at(other)))
     return {key: scores_by_seed(record, "error") for key, record in found.items()}
 
 

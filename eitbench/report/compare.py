@@ -11,8 +11,8 @@ import pandas as pd
 
 from eitbench import _check
 from eitbench._files import bundled_path, resolve_input
+from eitbench.bench import records as stored
 from eitbench.bench import statistics
-from eitbench.bench.records import finished_at, read_record, read_records, split_outdated
 from eitbench.bench.scores import scores
 from eitbench.bench.table import MISSING, Cell, Table
 from eitbench.bench.text import format_interval, format_number, scores_by_seed
@@ -37,13 +37,13 @@ def find_records(name: str, folder: Path) -> list[dict[str, Any]]:
     matches, or records of several versions match.
     """
     if name.endswith(".json"):
-        return [read_record(resolve_input(Path(name)))]
+        return [stored.read_record(resolve_input(Path(name)))]
     method, _, version = name.partition("@")
     known: set[str] = set()
     for place in dict.fromkeys(map(Path.resolve, (folder, BUNDLED_RECORDS, OWN_RECORDS))):
-        there = read_records(place)
+        there = stored.read_records(place)
         known |= {record["method"] for record in there}
-        current = there if version else split_outdated(there)[0]
+        current = there if version else stored.split_outdated(there)[0]
         own = [record for record in current
                if record["method"] == method and version in ("", record["version"])]
         if not version:
@@ -61,11 +61,8 @@ def find_records(name: str, folder: Path) -> list[dict[str, Any]]:
 def mean_over_trainings(records: list[dict[str, Any]]) -> list[dict[str, Any]]:
     """Return a record for each environment and split, with the mean of each score over the training
     seeds of an agent, in the episodes that all of them finished."""
-    groups: dict[tuple[str, str], list[dict[str, Any]]] = {}
-    for record in records:
-        groups.setdefault(_environment_and_split(record), []).append(record)
     means = []
-    for trainings in groups.values():
+    for trainings in stored.group_by(records, _environment_and_split).values():
         found = {name: statistics.mean_by_seed([scores_by_seed(each, name) for each in trainings])
                  for name in scores()}
         episodes = [{"seed": seed, "status": "ok", "scores": {
@@ -80,8 +77,8 @@ def mean_over_trainings(records: list[dict[str, Any]]) -> list[dict[str, Any]]:
 def naive_baseline_records(folder: Path) -> list[dict[str, Any]]:
     """Return the current records of naive baselines, of the package and then of a folder."""
     folders = dict.fromkeys([BUNDLED_RECORDS.resolve(), folder.resolve()])
-    return split_outdated([record for each in folders for record in read_records(each)
-                           if is_naive_baseline(record)])[0]
+    found = [record for each in folders for record in stored.read_records(each)]
+    return stored.split_outdated(list(filter(is_naive_baseline, found)))[0]
 
 
 def compare(a: list[dict[str, Any]], b: list[dict[str, Any]], score: str = "error",
@@ -107,8 +104,8 @@ def compare(a: list[dict[str, Any]], b: list[dict[str, Any]], score: str = "erro
     known = {each.name: each.direction for each in scores().values()}
     _check.choice("score", score, [name for name in known if known[name] in ("lower", "higher")])
     theirs = {_environment_and_split(record): scores_by_seed(record, score) for record in b}
-    levels = {_environment_and_split(record): scores_by_seed(record, "error") for record in
-              sorted(zero, key=lambda record: (record["official"], finished_at(record)))}
+    levels = {_environment_and_split(record): scores_by_seed(record)
+              for record in sorted(zero, key=stored.precedence)}
     pairs: dict[str, Pair] = {}
     gains: dict[str, dict[str, Pair]] = {kind: {} for kind in CATEGORIES}
     for record in sorted(a, key=_environment_and_split):

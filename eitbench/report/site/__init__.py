@@ -19,8 +19,8 @@ from markupsafe import Markup
 
 from eitbench._files import PACKAGE, replace_folder
 from eitbench._sanitize import escape_csv
+from eitbench.bench import records as stored
 from eitbench.bench.methods import baseline_folder, builtin_files, builtin_sha256, version_of
-from eitbench.bench.records import finished_at, group_runs, record_file_name, split_outdated
 from eitbench.bench.scores import scores
 from eitbench.bench.table import Cell, Table, number_cell
 from eitbench.bench.text import scores_by_seed
@@ -135,7 +135,7 @@ def render(site: Site) -> dict[str, str]:
     text = render_template(
         "site/leaderboard.md.j2", site=site, tables=tables, robustness=robustness,
         measured_columns=measured.MEASURED_COLUMNS, columns=column_descriptions(measured=False),
-        superseded=list(map(record_file_name, split_outdated(site.records)[1])))
+        superseded=list(map(stored.record_file_name, stored.split_outdated(site.records)[1])))
     table = leaderboard_table(site.boards).replace({"environment": {
         record["environment"]["name"]: qualified_name(record["environment"])
         for record in site.records}})
@@ -179,7 +179,7 @@ def index_page(site: Site) -> bytes:
             for board in site.boards),
         moving=site.address(HEADLINE[0]), still=site.address(HEADLINE[1]),
         shown=shown, about=CATEGORY_TEXTS,
-        last=max(map(finished_at, site.records), default="")[:10],
+        last=max(map(stored.finished_at, site.records), default="")[:10],
         explanations=tables.explanations(shown.values()))
 
 
@@ -230,13 +230,12 @@ def documentation(id: str) -> tuple[Markup, Markup]:
 def method_page(site: Site, name: str) -> bytes:
     """Return the HTML of the page of all versions of a method."""
     records = sorted((record for record in site.records if record["method"] == name),
-                     key=lambda record: (record["official"], finished_at(record)), reverse=True)
+                     key=stored.precedence, reverse=True)
     placements = [(board, row) for boards in site.classes.values() for board in boards
                   for row in board.rows if row.cells["method"] == name]
-    versions: dict[tuple[str, str], list[dict[str, Any]]] = {}
-    for record in records:              # agents of several environments share name and version
-        key = record["version"], str(record["parameters"].get("env"))
-        versions.setdefault(key, []).append(record)
+    # agents of several environments share name and version
+    versions = stored.group_by(
+        records, lambda record: (record["version"], str(record["parameters"].get("env"))))
     table, axes = _placements(placements)
     # agents of several environments have no common title
     title = name if len({env for _, env in versions}) > 1 else records[0]["title"]
@@ -245,8 +244,8 @@ def method_page(site: Site, name: str) -> bytes:
         versions=[(own, *_source(own[0])) for own in versions.values()],
         addresses={(row.cells["environment"], row.cells["version"]): board.address
                    for board, row in placements},
-        episode_table=_episodes, environment_title=environment_title, group_runs=group_runs,
-        record_file_name=record_file_name, to_json=partial(json.dumps, ensure_ascii=False))
+        episode_table=_episodes, environment_title=environment_title, group_runs=stored.group_runs,
+        record_file_name=stored.record_file_name, to_json=partial(json.dumps, ensure_ascii=False))
 
 
 def _placements(placements: list[tuple[Leaderboard, MethodRow]]) -> tuple[Table, dict[str, Axis]]:
