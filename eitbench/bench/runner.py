@@ -35,7 +35,7 @@ from eitbench.worlds.world import World
 
 Step = tuple[int, Estimate | None, dict[str, np.ndarray], float, np.ndarray | None]
 """t of the estimate, the estimate, the last voltages and currents, the computing time in s, and the
-covariance of its functionals (`Functionals`)"""
+covariance of its functionals (`functionals_of`)"""
 
 
 class EpisodeRun(NamedTuple):
@@ -110,26 +110,20 @@ def run_on_measurements(env: MeasuredEnv, method: str | Method, seed: int = 0, *
 
 def run_estimator(env: EstimationEnv, estimator: Method, seed: int) -> EpisodeRun:
     """Run an estimator on one episode."""
-    functionals = functionals_of(env)
-    rows = None if functionals is None else functionals.rows
-    output = EstimatorOutput(env.task, _iter_steps(env, estimator, seed, rows))
+    _, functionals = functionals_of(env) or (None, None)
+    output = EstimatorOutput(env.task, _iter_steps(env, estimator, seed, functionals))
     return EpisodeRun(output.outcome(env), output.fields())
 
 
-class Functionals(NamedTuple):
-    """Linear functionals of the concentration in a pipe; an estimator may return their covariance
-    (``docs/concepts.md``)."""
-
-    true_sections: np.ndarray
-    """(q, n_truth) mean of each of `N_SECTIONS` equal sections, of a concentration of the truth"""
-    rows: np.ndarray
-    """(q + k, n) the same of an estimate; then, in m³/s (m²/s in 2D), the solute flow through the
-    outlet, or its derivatives by the k parameters of the flow"""
-
-
 @lru_cache(maxsize=4)
-def functionals_of(env: EstimationEnv) -> Functionals | None:
-    """Return the functionals of an environment; None without a flow through the vessel."""
+def functionals_of(env: EstimationEnv) -> tuple[np.ndarray, np.ndarray] | None:
+    """Return linear functionals of the concentration in a pipe, whose covariance an estimator may
+    return (``docs/concepts.md``); None without a flow through the vessel.
+
+    They are (q, n_truth), the mean of each of `N_SECTIONS` equal sections of a concentration of the
+    truth; and (q + k, n), the same of an estimate, and then, in m³/s (m²/s in 2D), the solute flow
+    through the outlet, or its derivatives by the k parameters of the flow.
+    """
     task, model = env.task, env.task.transport
     truth = cached_truth_model(env.world).transport
     if not (isinstance(model, ConvectionDiffusion) and isinstance(truth, ConvectionDiffusion)
@@ -146,7 +140,7 @@ def functionals_of(env: EstimationEnv) -> Functionals | None:
     outlet = outlet_of(model)
     fields = task.velocity.basis_fields if task.velocity else [model.velocity]
     flows = [outlet.flow_weights(field) for field in fields]
-    return Functionals(averages, np.concatenate([averages @ interpolation, flows]))
+    return averages, np.concatenate([averages @ interpolation, flows])
 
 
 class EstimatorOutput:
@@ -162,7 +156,7 @@ class EstimatorOutput:
         self.velocity_variances = np.zeros_like(self.velocities)
         """(T, k) m²/s²; 0 if not reported"""
         self.covariances: dict[int, np.ndarray] = {}
-        """t -> covariance (q + k, q + k) of `Functionals.rows`"""
+        """t -> covariance (q + k, q + k) of the second functionals of `functionals_of`"""
         self.innovations: dict[int, tuple[np.ndarray, np.ndarray]] = {}
         """i of a measurement vector -> ν (L,) in V and S (L, L) in V²"""
         self.seconds: list[float] = []
@@ -236,9 +230,10 @@ class EstimatorOutput:
     def _flow_fields(self, env: EstimationEnv, truth: np.ndarray) -> dict[str, Any]:
         """Return the fields of the outcome on sections and outlet of a pipe, with the ``truth``
         (S, n_truth) of the scored states; none without a flow through the vessel."""
-        task, world, functionals = env.task, env.world, functionals_of(env)
-        if functionals is None:
+        task, world = env.task, env.world
+        if (found := functionals_of(env)) is None:
             return {}
+        averages, functionals = found
         states = slice(task.warm_up, None)
         means = self.means[states]
         model: Any = cached_truth_model(world).transport
@@ -246,11 +241,11 @@ class EstimatorOutput:
         drawn = world.flow.draw(world, episode_streams(env.core.seeds[0]).flow)
         true = np.array([outlet.flow_weights(drawn(t) if drawn else velocity) @ concentration
                          for t, concentration in enumerate(truth, task.warm_up + 1)])
-        sections, parts = np.split(means @ functionals.rows.T, [len(functionals.true_sections)], 1)
+        sections, parts = np.split(means @ functionals.T, [len(averages)], 1)
         theta = self.velocities[states] if task.velocity else np.ones_like(parts)
         fields: dict[str, Any] = {
             "solute_flow": ((parts * theta).sum(axis=1), true),
-            "sections": (sections, truth @ functionals.true_sections.T)}
+            "sections": (sections, truth @ averages.T)}
         if all(t in self.covariances for t in range(task.warm_up + 1, task.n_steps + 1)):
             covariances = np.array([self.covariances[t] for t in sorted(self.covariances)])
             q = sections.shape[1]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import tempfile
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
@@ -52,13 +52,15 @@ def verify(
     record's sha256, and runs under bubblewrap unless --isolate process is given. Standard output is
     Markdown.
     """
+    import hashlib
     import secrets
 
-    from eitbench.bench.held_out import read_secret
-    from eitbench.bench.verify import select_records
+    from eitbench.bench import verify as verification
+    from eitbench.bench.held_out import read_secret, verify_all_held_out
+    from eitbench.bench.table import Table
     _check_arguments(paths or [], every, top, episodes, held_out, secret, method)
     key = read_secret(secret) if secret else b""
-    chosen = paths or select_records(records, env or [], top=top)
+    chosen = paths or verification.select_records(records, env or [], top=top)
     if missing := [str(path) for path in chosen if not path.is_file()]:
         raise ValueError(f"records must be files, got {', '.join(missing)}")
     if every and out is None:
@@ -67,11 +69,21 @@ def verify(
     problems: list[str] = []
     with tempfile.TemporaryDirectory(prefix="eitbench-verify-") as temporary:
         if episodes:
-            problems += _rerun(chosen, out or Path(temporary), tolerance, episodes, drawn,
-                               {"file": method, "isolate": isolate, "replay": replay,
-                                "n_jobs": jobs, "backend": backend})
+            rows = verification.verify(
+                chosen, out or Path(temporary), file=method, isolate=isolate, replay=replay,
+                episodes=episodes, seed=drawn, n_jobs=jobs, backend=backend)
+            table = verification.verification_table(rows, tolerance)
+            options.echo(f"episodes drawn with --seed {drawn}\n\n{table}\n")
+            for note in dict.fromkeys(filter(None, rows["note"])):
+                options.echo(f"{note}\n")
+            problems += verification.describe_problems(rows, tolerance)
         if held_out:
-            problems += _held_out(chosen, Path(temporary), method, isolate, key, held_out)
+            ratios, found = verify_all_held_out(chosen, Path(temporary), method, isolate, key,
+                                                held_out)
+            table = Table.of(ratios).markdown() if ratios else ""
+            options.echo("held-out episodes of the secret with sha256 "
+                         f"{hashlib.sha256(key).hexdigest()}\n\n{table}\n")
+            problems += [f"differs: {problem}" for problem in found]
     for problem in problems:
         options.echo(sanitize(problem), err=True)
     if problems:
@@ -91,29 +103,3 @@ def _check_arguments(paths: list[Path], every: bool, top: int, episodes: int, he
         raise ValueError("--held-out and --secret belong together")
     if not episodes and not held_out:
         raise ValueError("--episodes must be at least 1 without --held-out, got 0")
-
-
-def _rerun(paths: list[Path], folder: Path, tolerance: float, episodes: int, seed: int,
-           how: dict[str, Any]) -> list[str]:
-    """Print the table of reruns and return the problems."""
-    from eitbench.bench import verify as verification
-    rows = verification.verify(paths, folder, episodes=episodes, seed=seed, **how)
-    table = verification.verification_table(rows, tolerance)
-    options.echo(f"episodes drawn with --seed {seed}\n\n{table}\n")
-    for note in dict.fromkeys(filter(None, rows["note"])):
-        options.echo(f"{note}\n")
-    return verification.describe_problems(rows, tolerance)
-
-
-def _held_out(paths: list[Path], folder: Path, method: str | None, isolate: str, secret: bytes,
-              episodes: int) -> list[str]:
-    """Print the table of held-out episodes and return the problems."""
-    import hashlib
-
-    from eitbench.bench.held_out import verify_all_held_out
-    from eitbench.bench.table import Table
-    rows, problems = verify_all_held_out(paths, folder, method, isolate, secret, episodes)
-    digest = hashlib.sha256(secret).hexdigest()
-    table = Table.of(rows).markdown() if rows else ""
-    options.echo(f"held-out episodes of the secret with sha256 {digest}\n\n{table}\n")
-    return [f"differs: {problem}" for problem in problems]

@@ -58,12 +58,9 @@ class Failure(NamedTuple):
 def select_requested(records: Iterable[dict[str, Any]], jobs: Iterable[Job],
                      ) -> list[dict[str, Any]]:
     """Return the records restricted to the episodes of these jobs."""
-    asked: dict[tuple[str, str], set[str]] = {}
-    for job in jobs:
-        name = job.environment.name, job.load().name
-        asked.setdefault(name, set()).add(format_seed(job.seed))
-    found = (restrict(record, asked.get((record["environment"]["name"], record["method"]), ()))
-             for record in records)
+    asked = {(job.environment.name, job.load().name, format_seed(job.seed)) for job in jobs}
+    found = (restrict(record, [seed for seed in record["seeds"] if (
+        record["environment"]["name"], record["method"], seed) in asked]) for record in records)
     return [record for record in found if record["episodes"]]
 
 

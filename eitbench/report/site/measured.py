@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 import pandas as pd
 
-from eitbench.bench.records import finished_at, read_valid_files
+from eitbench.bench.records import finished_at, group_by, read_valid_files
 from eitbench.bench.scores import scores
 from eitbench.bench.table import Cell, Table, number_cell
 from eitbench.bench.text import format_number, scores_by_seed
@@ -46,13 +46,11 @@ class MeasuredBoards(NamedTuple):
         latest = {(record["environment"]["id"], record["method"]): record
                   for record in sorted(found.values(), key=finished_at)
                   if any(episode["status"] == "ok" for episode in record["episodes"])}
-        cases: dict[str, MeasuredCase] = {}
-        records: dict[str, list[dict[str, Any]]] = {}
-        for (id, _), record in sorted(latest.items()):
-            case = read_case(registered_kwargs(id)["case"])
-            cases[case.name] = case
-            records.setdefault(case.name, []).append(record)
-        return cls(cases, {name: sorted(own, key=withheld_rmse) for name, own in records.items()},
+        groups = group_by(dict(sorted(latest.items())).values(),
+                          lambda record: record["environment"]["id"])
+        cases = {id: read_case(registered_kwargs(id)["case"]) for id in groups}
+        return cls({case.name: case for case in cases.values()},
+                   {cases[id].name: sorted(own, key=withheld_rmse) for id, own in groups.items()},
                    complaints)
 
     def case_table(self, case: str) -> Table:
