@@ -14,10 +14,10 @@ from tqdm import tqdm
 from eitbench._files import bundled_path
 from eitbench.bench.records import read_records
 from eitbench.bench.run import Job, run_episode
-from eitbench.bench.text import format_mean, mean_and_interval, scores_by_seed, seed_ranges
+from eitbench.bench.text import format_mean, mean_and_interval, scores_by_seed
 from eitbench.bench.tracks import Environment
 from eitbench.bench.verify import job_for_record
-from eitbench.data.seeds import parse_seeds
+from eitbench.data.seeds import parse_seeds, seed_ranges
 
 POLICIES = {"Pipe2DInjection": ("best_pair", "random_pair"),
           "Pipe2DInjectionFaults": ("fault_aware", "ppo_seed0", "schedule"),

@@ -10,7 +10,6 @@ from scipy.stats import t as student
 
 from eitbench.bench.scores import scores
 from eitbench.bench.tracks import is_measured
-from eitbench.data.seeds import seed_ranges
 
 
 def mean_and_interval(values: list[float]) -> tuple[float, float]:
@@ -70,12 +69,6 @@ def describe_scores(record: dict[str, Any]) -> str:
         if values := list(scores_by_seed(record, name).values()):
             parts.append(f"{score.heading} {format_mean(*mean_and_interval(values))}")
     return ", ".join(parts)
-
-
-def episodes_worse_than_homogeneous(record: dict[str, Any]) -> str:
-    """Return the seeds of the episodes whose error is larger than the homogeneous estimate's."""
-    return seed_ranges([seed for seed, contrast in
-                        scores_by_seed(record, "contrast_error").items() if contrast > 1.0])
 
 
 def format_number(value: float) -> str:

@@ -183,15 +183,6 @@ def _subtrack_of_lag(lag: int, world: Any) -> str:
     return "smoothing" if lag == world.n_steps - 1 else "fixed-lag"
 
 
-def category_of(id: str, board: str) -> str:
-    """Return the category of an environment, one of `CATEGORIES`; ``measured`` for a case."""
-    if is_measured(id):
-        return "measured"
-    each = entries().get(id)
-    at_rest = each is not None and getattr(each.world.target, "is_stationary", False)
-    return "stationary" if at_rest else board
-
-
 def default_seeds(id: str, suite: str = "full") -> list[int]:
     """Return the default seeds of an environment, which are test episodes."""
     if is_measured(id):

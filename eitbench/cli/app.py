@@ -101,7 +101,8 @@ def submit(
     from eitbench.bench.records import read_record
     from eitbench.bench.store import EpisodeStore
     from eitbench.bench.submit import submit
-    from eitbench.bench.text import describe_scores, episodes_worse_than_homogeneous
+    from eitbench.bench.text import describe_scores, scores_by_seed
+    from eitbench.data.seeds import seed_ranges
     if baseline and policy:
         raise ValueError("one of --baseline and --policy may be given, got both")
     seeds_asked = options.parse_episodes(seeds)
@@ -110,9 +111,10 @@ def submit(
                        n_jobs=jobs, backend=backend, command=command_line()):
         record = read_record(path)
         options.echo(f"wrote {path}: {describe_scores(record)}")
-        if worse := episodes_worse_than_homogeneous(record):
+        contrasts = scores_by_seed(record, "contrast_error")
+        if worse := [seed for seed, contrast in contrasts.items() if contrast > 1.0]:
             options.echo("warning: ẽ_c is larger than for the homogeneous estimate in "
-                         f"{worse}; the method may have diverged", err=True)
+                         f"{seed_ranges(worse)}; the method may have diverged", err=True)
 
 
 command()(verify)

@@ -22,8 +22,9 @@ from eitbench.bench import records as stored
 from eitbench.bench import statistics, tracks
 from eitbench.bench.episode_table import read_episode_table, table_path
 from eitbench.bench.scores import scores
-from eitbench.bench.text import scores_by_seed, seed_ranges
+from eitbench.bench.text import scores_by_seed
 from eitbench.bench.variants import flatten, format_setting
+from eitbench.data.seeds import seed_ranges
 from eitbench.scoring import normalised_score
 from eitbench.worlds.registry import entries
 
@@ -211,8 +212,13 @@ def leaderboard_table(found: Iterable[Leaderboard]) -> pd.DataFrame:
 
 
 def record_category(record: dict[str, Any]) -> str:
-    """Return the category of a record, one of `CATEGORIES`."""
-    return tracks.category_of(record["environment"]["id"], record["board"])
+    """Return the category of a record, one of `CATEGORIES`; ``measured`` for a case."""
+    id = record["environment"]["id"]
+    if tracks.is_measured(id):
+        return "measured"
+    each = entries().get(id)
+    at_rest = each is not None and getattr(each.world.target, "is_stationary", False)
+    return "stationary" if at_rest else str(record["board"])
 
 
 def base_environment(id: str) -> str:

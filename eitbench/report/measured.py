@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from itertools import cycle
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 import pandas as pd
@@ -16,16 +15,13 @@ from matplotlib.patches import Circle
 from matplotlib.ticker import FuncFormatter
 
 from eitbench._files import write_atomically
-from eitbench.bench.measured import N_PLOTTED_FRAMES
+from eitbench.bench.measured import N_PLOTTED_FRAMES, MeasuredRun
+from eitbench.envs.measured import MeasuredEnv
 from eitbench.envs.rendering import draw_electrodes, draw_field
 from eitbench.measured.calibration import electrode_misfits
 from eitbench.measured.quality import percent
 from eitbench.measured.segmentation import ktc_score, require_round_tank, segment
 from eitbench.report.templates import data_uri, figure_image, render_template
-
-if TYPE_CHECKING:
-    from eitbench.bench.measured import MeasuredRun
-    from eitbench.envs.measured import MeasuredEnv
 
 CLASS_COLOURS = ListedColormap(["#f4f4f2", "#d1495b", "#0b6e75"])
 """Water, resistive, conductive."""

@@ -22,11 +22,11 @@ from eitbench.bench import tracks
 from eitbench.bench.records import group_runs
 from eitbench.bench.run import Job
 from eitbench.bench.store import EpisodeStore
-from eitbench.bench.text import scores_by_seed, seed_ranges
+from eitbench.bench.text import scores_by_seed
 from eitbench.bench.tracks import Environment
 from eitbench.data.episode_cache import truth_mesh
 from eitbench.data.episodes import simulate
-from eitbench.data.seeds import format_seed, parse_seeds
+from eitbench.data.seeds import format_seed, parse_seeds, seed_ranges
 from eitbench.envs.rendering import FIELD_COLORMAP, colour_range, draw_field
 from eitbench.numerics.mesh import Mesh
 from eitbench.report import tables

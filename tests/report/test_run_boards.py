@@ -4,7 +4,8 @@ import math
 
 import numpy as np
 import pytest
-from eitbench.bench.text import format_interval, format_mean, format_number, mean_and_interval, seed_ranges
+from eitbench.bench.text import format_interval, format_mean, format_number, mean_and_interval
+from eitbench.data.seeds import seed_ranges
 from eitbench.report.boards import environment_title, run_leaderboards, world_key
 from eitbench.report.tables import run_table, terminal_tables
 from hypothesis import given

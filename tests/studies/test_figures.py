@@ -8,10 +8,9 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
-from eitbench.bench.text import seed_ranges
 from eitbench.data.cache import CACHE_VARIABLE
 from eitbench.data.episode_cache import truth_mesh
-from eitbench.data.seeds import format_seed
+from eitbench.data.seeds import format_seed, seed_ranges
 from eitbench.envs.estimation import EstimationEnv
 from eitbench.estimation import initial_covariance
 from eitbench.physics.stationary import StationaryTransport
