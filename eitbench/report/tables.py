@@ -13,17 +13,8 @@ import numpy as np
 from eitbench._sanitize import escape_markdown
 from eitbench.bench.table import MISSING, Cell, Table, mean_cell, number_cell
 from eitbench.bench.text import format_interval, format_number, scores_by_seed
-from eitbench.report import charts
-from eitbench.report.boards import (
-    COST_COLUMNS,
-    INTERVAL_HEADINGS,
-    Leaderboard,
-    MethodRow,
-    column_descriptions,
-    columns,
-    headings,
-    naive_baseline_record,
-)
+from eitbench.report import boards, charts
+from eitbench.report.boards import Leaderboard, MethodRow
 
 INDEX_COLUMNS = ("seconds_per_step", "peak_memory")
 """Number columns of the index page; the page of an environment has all."""
@@ -47,7 +38,7 @@ def score_axes(board: Leaderboard) -> dict[str, charts.Axis]:
     def ends(name: str) -> list[float]:
         return [end for row in board.rows for end in row.interval(name) if math.isfinite(end)]
 
-    floor = naive_baseline_record(board.records)
+    floor = boards.naive_baseline_record(board.records)
     zero = next((row.cells["error"] for row in board.rows if row.record is floor), None)
     errors = [end for end in ends("error") if end > 0] or [1.0]
     least = max(min([0.0, *ends("gain")]), SKILL_AXIS_MIN)
@@ -59,7 +50,7 @@ def score_axes(board: Leaderboard) -> dict[str, charts.Axis]:
 def _interval_cells(row: MethodRow, axes: dict[str, charts.Axis]) -> dict[str, Cell]:
     """Return heading -> cell of each score with an interval."""
     return {heading: interval_cell(row, name, axes[heading])
-            for name, heading in INTERVAL_HEADINGS.items()}
+            for name, heading in boards.INTERVAL_HEADINGS.items()}
 
 
 def interval_cell(row: MethodRow, name: str, axis: charts.Axis) -> Cell:
@@ -77,7 +68,7 @@ def interval_cell(row: MethodRow, name: str, axis: charts.Axis) -> Cell:
 
 
 def _number_cells(row: MethodRow, names: Iterable[str]) -> dict[str, Cell]:
-    return {headings()[name]: number_cell(row.cells[name]) for name in names}
+    return {boards.headings()[name]: number_cell(row.cells[name]) for name in names}
 
 
 def _rank_cell(row: MethodRow, rows: list[MethodRow]) -> Cell:
@@ -119,7 +110,7 @@ def page_table(board: Leaderboard, root: str, *, compact: bool = False) -> Table
         badges = _outperformed(row, together) + author_badges(row)
         return {"rank": _rank_cell(row, together), "method": method_cell(row, root, badges),
                 **_interval_cells(row, axes),
-                **_number_cells(row, INDEX_COLUMNS if compact else headings())}
+                **_number_cells(row, INDEX_COLUMNS if compact else boards.headings())}
 
     every = [each for row in together for each in (row, *row.trainings)]
     made = Table.of(map(cells, every), label=board.title, keep=["rank"],
@@ -146,7 +137,7 @@ def markdown_table(board: Leaderboard) -> Table:
         "rank": _rank_cell(row, board.rows), "method": method_cell(row, ""),
         **_interval_cells(row, axes),
         "run by": "".join(author_badges(row)) or "official",
-        **_number_cells(row, headings())} for row in board.rows], keep=["rank"])
+        **_number_cells(row, boards.headings())} for row in board.rows], keep=["rank"])
 
 
 def run_table(board: Leaderboard, *, title: str = "title", drawn: bool = False) -> Table:
@@ -162,7 +153,7 @@ def run_table(board: Leaderboard, *, title: str = "title", drawn: bool = False) 
                 None) if board.category == "injection" and len(board.rows) > 1 else None
     seeds = run_seeds(board)
     score = "prediction_error" if board.category == "measured" else "error"
-    others = [name for name in headings() if name not in (score, *COST_COLUMNS)]
+    others = [name for name in boards.headings() if name not in (score, *boards.COST_COLUMNS)]
     rows = []
     for row, played in zip(board.rows, seeds, strict=True):
         name, own = row.cells[title], scores_by_seed(row.record, score)
@@ -173,7 +164,7 @@ def run_table(board: Leaderboard, *, title: str = "title", drawn: bool = False) 
         if drawn and score == "error":
             cells |= _interval_cells(row, axes)
         else:
-            cells[columns()[score][0]] = mean_cell(own.values())
+            cells[boards.columns()[score][0]] = mean_cell(own.values())
         if best:
             other = scores_by_seed(best.record)
             cells[f"difference to {best.cells['method']}"] = Cell(MISSING) if row is best else (
@@ -202,17 +193,17 @@ def run_title(board: Leaderboard) -> str:
 def explanations(tables: Iterable[Table]) -> dict[str, str]:
     """Return heading -> explanation of the headings of these tables."""
     shown = {heading for each in tables for heading in each.headings}
-    return {heading: text for heading, text in column_descriptions().items()
+    return {heading: text for heading, text in boards.column_descriptions().items()
             if heading in shown}
 
 
 # -- text ------------------------------------------------------------------------------------------
 
 
-def terminal_tables(boards: Sequence[Leaderboard], characters: int) -> str:
+def terminal_tables(found: Sequence[Leaderboard], characters: int) -> str:
     """Return a table of each board, at most ``characters`` wide, and notes."""
     parts, left_out = list[str](), list[str]()
-    for board in boards:
+    for board in found:
         table = run_table(board, title="method")
         table = table._replace(rows=[row._replace(cells=[
             cell._replace(text=charts.truncate(cell.text, MAX_LABEL_CHARS)) for cell in row.cells])
@@ -231,10 +222,10 @@ def terminal_tables(boards: Sequence[Leaderboard], characters: int) -> str:
     return "\n\n".join(parts)
 
 
-def markdown(boards: Sequence[Leaderboard]) -> str:
+def markdown(found: Sequence[Leaderboard]) -> str:
     """Return the tables of all boards as Markdown."""
     return "\n\n".join(f"## {escape_markdown(run_title(board))}\n\n{run_table(board).markdown()}"
-                       for board in boards) + "\n"
+                       for board in found) + "\n"
 
 
 # -- charts ----------------------------------------------------------------------------------------

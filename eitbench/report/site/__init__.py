@@ -26,18 +26,8 @@ from eitbench.bench.table import Cell, Table, number_cell
 from eitbench.bench.text import scores_by_seed
 from eitbench.bench.tracks import environment_name, nominal_id, qualified_name
 from eitbench.envs.env_docs import describe_environment
-from eitbench.report import tables
-from eitbench.report.boards import (
-    ALL,
-    Leaderboard,
-    MethodRow,
-    aggregate_environments,
-    column_descriptions,
-    environment_title,
-    headings,
-    leaderboard_table,
-    leaderboards,
-)
+from eitbench.report import boards, tables
+from eitbench.report.boards import ALL, Leaderboard, MethodRow
 from eitbench.report.charts import Axis
 from eitbench.report.site import measured, robustness
 from eitbench.report.templates import markdown, render_template
@@ -109,7 +99,7 @@ def collect(records: Iterable[dict[str, Any]], folder: Path | None = None) -> Si
     ordered = sorted(records, key=lambda record: (
         record["environment"]["name"], record["method"], record["version"]))
     found = measured.MeasuredBoards.of(folder) if folder else measured.EMPTY
-    return Site(leaderboards(ordered), ordered, found, folder)
+    return Site(boards.leaderboards(ordered), ordered, found, folder)
 
 
 def render_site(site: Site) -> dict[str, bytes]:
@@ -134,9 +124,10 @@ def render(site: Site) -> dict[str, str]:
     in the second only."""
     text = render_template(
         "site/leaderboard.md.j2", site=site, tables=tables, robustness=robustness,
-        measured_columns=measured.MEASURED_COLUMNS, columns=column_descriptions(measured=False),
+        measured_columns=measured.MEASURED_COLUMNS,
+        columns=boards.column_descriptions(measured=False),
         superseded=list(map(stored.record_file_name, stored.split_outdated(site.records)[1])))
-    table = leaderboard_table(site.boards).replace({"environment": {
+    table = boards.leaderboard_table(site.boards).replace({"environment": {
         record["environment"]["name"]: qualified_name(record["environment"])
         for record in site.records}})
     for name, score in scores().items():
@@ -175,7 +166,7 @@ def index_page(site: Site) -> bytes:
         "index", headline=headline(site), filters=filters, policies=policies,
         best_filters=best[0], best_policies=best[1],
         n_filter_environments=sum(
-            board.category == "filter" and board.environment in aggregate_environments()
+            board.category == "filter" and board.environment in boards.aggregate_environments()
             for board in site.boards),
         moving=site.address(HEADLINE[0]), still=site.address(HEADLINE[1]),
         shown=shown, about=CATEGORY_TEXTS,
@@ -231,7 +222,7 @@ def method_page(site: Site, name: str) -> bytes:
     """Return the HTML of the page of all versions of a method."""
     records = sorted((record for record in site.records if record["method"] == name),
                      key=stored.precedence, reverse=True)
-    placements = [(board, row) for boards in site.classes.values() for board in boards
+    placements = [(board, row) for own in site.classes.values() for board in own
                   for row in board.rows if row.cells["method"] == name]
     # agents of several environments share name and version
     versions = stored.group_by(
@@ -244,8 +235,9 @@ def method_page(site: Site, name: str) -> bytes:
         versions=[(own, *_source(own[0])) for own in versions.values()],
         addresses={(row.cells["environment"], row.cells["version"]): board.address
                    for board, row in placements},
-        episode_table=_episodes, environment_title=environment_title, group_runs=stored.group_runs,
-        record_file_name=stored.record_file_name, to_json=partial(json.dumps, ensure_ascii=False))
+        episode_table=_episodes, environment_title=boards.environment_title,
+        group_runs=stored.group_runs, record_file_name=stored.record_file_name,
+        to_json=partial(json.dumps, ensure_ascii=False))
 
 
 def _placements(placements: list[tuple[Leaderboard, MethodRow]]) -> tuple[Table, dict[str, Axis]]:
@@ -271,13 +263,13 @@ def _placements(placements: list[tuple[Leaderboard, MethodRow]]) -> tuple[Table,
 def _episodes(record: dict[str, Any]) -> Table:
     """Return one row for each episode, with the scores that any of them has."""
     values = {heading: scores_by_seed(record, name)
-              for name, heading in ({"error": "ẽ_c"} | headings()).items()}
+              for name, heading in ({"error": "ẽ_c"} | boards.headings()).items()}
     return Table.of([{
         "seed": Cell(episode["seed"], float(i)), "status": episode["status"],
         **{heading: number_cell(own.get(episode["seed"])) for heading, own in values.items()},
         "date": Cell(episode["finished"][:10], episode["finished"]),
     } for i, episode in enumerate(record["episodes"])],
-        label=f"Episodes of {environment_title(record)}")
+        label=f"Episodes of {boards.environment_title(record)}")
 
 
 def _source(record: dict[str, Any]) -> tuple[str, Markup]:
