@@ -20,22 +20,9 @@ from tqdm import tqdm
 
 from eitbench import _check
 from eitbench._sanitize import error_location, user_traceback
-from eitbench.bench import isolation, tracks
+from eitbench.bench import isolation, methods, tracks
 from eitbench.bench.isolation import WorkerError, choose_isolation
-from eitbench.bench.methods import (
-    METHOD_KINDS,
-    Method,
-    builtin_agents,
-    builtin_methods,
-    find_method,
-    installed_methods,
-    is_path,
-    load_method,
-    loader_of,
-    method_files,
-    method_sha256,
-    version_of,
-)
+from eitbench.bench.methods import Method, builtin_agents, builtin_methods
 from eitbench.bench.records import COMMON_FIELDS
 from eitbench.bench.runner import cached_environment, is_compatible, run_method
 from eitbench.bench.scores import SCORING, compute_scores
@@ -69,14 +56,14 @@ class Job(NamedTuple):
             return isolation.load_isolated(track, self.environment.id, self.environment.kwargs,
                                            self.method, self.isolation)
         with redirect_stdout(sys.stderr):
-            return load_method(self.method, track)
+            return methods.load_method(self.method, track)
 
     def identity(self) -> str:
         """Return a digest of the configuration and declared versions that determine the outcome; a
         stored result is reused only if the digests are equal. The method is not loaded.
         ``ValueError`` for an unknown method or environment."""
-        path = find_method(self.method, self.environment.track)
-        contents = method_files(path)
+        path = methods.find_method(self.method, self.environment.track)
+        contents = methods.method_files(path)
         files = {name: hashlib.sha256(content).hexdigest() for name, content in contents.items()
                  if name != "sha256"}
         id, arguments = self.environment.id, self.environment.arguments
@@ -84,12 +71,12 @@ class Job(NamedTuple):
         world = (read_case(registered_kwargs(id)["case"]).digest if is_measured(id)
                  else world_digest(entry(id).world.with_changes(changes)))
         parts = {"environment": id, "arguments": arguments, "world": world, "files": files,
-                 "loader": loader_of(path), "seed": self.seed, "scoring": SCORING,
-                 "version": version_of(path, method_sha256(contents))}
+                 "loader": methods.loader_of(path), "seed": self.seed, "scoring": SCORING,
+                 "version": methods.version_of(path, methods.method_sha256(contents))}
         return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()[:16]
 
 
-def make_jobs(track: str, environments: list[str], methods: list[str],
+def make_jobs(track: str, environments: list[str], chosen: list[str],
               seeds: list[int] | None = None, *, suite: str = "full", estimator: str = "full",
               isolate: str = "auto", strict: bool = False,
               worlds: Sequence[dict[str, Any]] = ({},)) -> list[Job]:
@@ -104,8 +91,8 @@ def make_jobs(track: str, environments: list[str], methods: list[str],
     """
     _check.choice("estimator", estimator, tracks.ONBOARD_FILTERS)
     given = {} if estimator == "full" else {"estimator": estimator}
-    for method in methods:
-        find_method(method, track)
+    for method in chosen:
+        methods.find_method(method, track)
     if not environments:
         quick = track == "estimation" and suite == "quick"
         environments = list(tracks.QUICK_IDS) if quick else tracks.ids(track)
@@ -124,8 +111,8 @@ def make_jobs(track: str, environments: list[str], methods: list[str],
         names = dict[str, str]()
         # environment by environment: models are cached for a few only, and a worker serves one
         # method
-        for method in methods or [*builtin_methods(track), *builtin_agents(id)]:
-            skipped = suite == "quick" and not methods and (board, method) in TOO_SLOW_FOR_QUICK
+        for method in chosen or [*builtin_methods(track), *builtin_agents(id)]:
+            skipped = suite == "quick" and not chosen and (board, method) in TOO_SLOW_FOR_QUICK
             job = isolated_job(asked, method, isolate, strict)
             loaded = job.load()
             if (other := names.setdefault(loaded.name, method)) != method:
@@ -136,9 +123,10 @@ def make_jobs(track: str, environments: list[str], methods: list[str],
                 fitting.add(method)
                 todo += [job._replace(seed=seed) for seed in numbers]
     if missing := [f"{method} (trained in {trained_in[method]})" if trained_in[method] else method
-                   for method in methods if method not in fitting]:
-        raise ValueError(f"{METHOD_KINDS[track].kind} {', '.join(missing)} suits none of the "
-                         f"environments {', '.join(environments)}; see `eitbench list`")
+                   for method in chosen if method not in fitting]:
+        kind = methods.METHOD_KINDS[track].kind
+        raise ValueError(f"{kind} {', '.join(missing)} suits none of the environments "
+                         f"{', '.join(environments)}; see `eitbench list`")
     return todo
 
 
@@ -146,8 +134,8 @@ def isolated_job(environment: Environment, method: str, isolate: str,
                  strict: bool = False) -> Job:
     """Return the job of a method, given by name or path; see `isolation.choose_isolation`."""
     kind = choose_isolation(environment, method, isolate, strict=strict)
-    path = installed_methods().get(method, Path(method))
-    return Job(environment, str(path.absolute()) if is_path(str(path)) else method, 0, kind)
+    path = methods.installed_methods().get(method, Path(method))
+    return Job(environment, str(path.absolute()) if methods.is_path(str(path)) else method, 0, kind)
 
 
 def run_episode(job: Job) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
