@@ -47,7 +47,16 @@ def export_minari(name: str, env: str, policy: str, seeds: str | Sequence[int], 
     """
     with require_extra("format minari"):
         from minari import create_dataset_from_buffers
-    _check_name(name)
+        from minari.dataset.minari_dataset import parse_dataset_id
+        from minari.storage.datasets_root_dir import get_dataset_path
+    try:
+        parse_dataset_id(name)
+    except ValueError:
+        raise ValueError("out must be the name of a Minari data set, such as "
+                         f"eitbench/pipe2d/random-pair-v0; got {name!r}") from None
+    if get_dataset_path(name).exists():
+        raise ValueError(f"out must be the name of a new data set; there is {name!r}, which "
+                         f"`minari delete {name}` removes")
     check_track(env, "injection")
     numbers = resolve_seeds(seeds)
     method = load_method(policy, "injection")
@@ -70,19 +79,6 @@ def export_minari(name: str, env: str, policy: str, seeds: str | Sequence[int], 
                                 ref_max_score=max(returns.values(), default=None),
                                 num_episodes_average_score=N_EPISODES, description=description)
     return len(episodes)
-
-
-def _check_name(name: str) -> None:
-    from minari.dataset.minari_dataset import parse_dataset_id
-    from minari.storage.datasets_root_dir import get_dataset_path
-    try:
-        parse_dataset_id(name)
-    except ValueError:
-        raise ValueError("out must be the name of a Minari data set, such as "
-                         f"eitbench/pipe2d/random-pair-v0; got {name!r}") from None
-    if get_dataset_path(name).exists():
-        raise ValueError(f"out must be the name of a new data set; there is {name!r}, which "
-                         f"`minari delete {name}` removes")
 
 
 def _run(env: gym.Env[Any, Any], policy: Method, seed: int, number: int) -> EpisodeBuffer:

@@ -59,8 +59,8 @@ class Site(NamedTuple):
     """Class by class, each followed by its aggregate."""
     records: list[dict[str, Any]]
     """Sorted; superseded ones included."""
-    measured: measured.MeasuredBoards = measured.EMPTY
-    folder: Path | None = None
+    measured: measured.MeasuredBoards
+    folder: Path | None
     """Folder of the leaderboards, which will hold the site; pages link to files around it."""
 
     @property
@@ -98,7 +98,7 @@ def collect(records: Iterable[dict[str, Any]], folder: Path | None = None) -> Si
     """
     ordered = sorted(records, key=lambda record: (
         record["environment"]["name"], record["method"], record["version"]))
-    found = measured.MeasuredBoards.of(folder) if folder else measured.EMPTY
+    found = measured.MeasuredBoards.of(folder) if folder else measured.MeasuredBoards({}, {}, [])
     return Site(boards.leaderboards(ordered), ordered, found, folder)
 
 

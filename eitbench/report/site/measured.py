@@ -84,9 +84,6 @@ class MeasuredBoards(NamedTuple):
             for label in order], label="all cases")
 
 
-EMPTY = MeasuredBoards({}, {}, [])
-
-
 def withheld_rmse(record: dict[str, Any]) -> float:
     """Mean over the episodes, relative to the noise."""
     return fmean(scores_by_seed(record, "prediction_error").values())
