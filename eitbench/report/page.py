@@ -19,7 +19,7 @@ from eitbench import _check
 from eitbench._files import write_atomically
 from eitbench._sanitize import sanitize
 from eitbench.bench import tracks
-from eitbench.bench.records import group_runs
+from eitbench.bench.records import group_by, group_runs
 from eitbench.bench.run import Job
 from eitbench.bench.store import EpisodeStore
 from eitbench.bench.text import scores_by_seed
@@ -68,12 +68,10 @@ def failures(store: EpisodeStore, records: Iterable[dict[str, Any]]) -> list[Fai
     """Return the failures of records of a store, in their order."""
     found = []
     for record in records:
-        seeds: dict[tuple[str, str], list[str]] = {}
-        for episode in record["episodes"]:
-            if episode["status"] != "ok":
-                error = episode["message"], store.traceback(record, episode["seed"])
-                seeds.setdefault(error, []).append(episode["seed"])
-        found += [Failure(record, those, *error) for error, those in seeds.items()]
+        errors = {episode["seed"]: (episode["message"], store.traceback(record, episode["seed"]))
+                  for episode in record["episodes"] if episode["status"] != "ok"}
+        found += [Failure(record, seeds, *error)
+                  for error, seeds in group_by(errors, errors.__getitem__).items()]
     return found
 
 
