@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import math
 from collections.abc import Collection, Iterable
 from pathlib import Path
@@ -10,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from eitbench._files import write_atomically
+from eitbench._files import atomic_path
 from eitbench.bench.scores import Outcome
 from eitbench.envs.measured import MeasuredEnv
 from eitbench.measured.segmentation import ktc_score, segment
@@ -103,10 +102,9 @@ class MeasuredRun:
         names = ("steps", "mean", "variance", "nis", "withheld_residual_rms", "velocity")
         arrays: dict[str, Any] = {name: getattr(self, name) for name in names
                                   if getattr(self, name) is not None}
-        content = io.BytesIO()
-        np.savez_compressed(content, times=env.measurements.times, points=env.task.mesh.points,
-                            cells=env.task.mesh.cells, **arrays)
-        write_atomically(path, content.getvalue())
+        with atomic_path(path) as temporary, temporary.open("wb") as file:
+            np.savez_compressed(file, times=env.measurements.times, points=env.task.mesh.points,
+                                cells=env.task.mesh.cells, **arrays)
 
 
 def _root_mean(squares: np.ndarray) -> float:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import json
 import os
 import platform
@@ -21,7 +20,7 @@ from typing import Any
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from eitbench._files import PACKAGE, write_atomically
+from eitbench._files import PACKAGE, atomic_path, write_atomically
 from eitbench._sanitize import sanitize
 from eitbench.bench import records as stored
 from eitbench.bench.scores import SCORING
@@ -49,9 +48,8 @@ class EpisodeStore:
         """Store the ``result`` of one episode, and before it the estimates ``fields``."""
         path = self._path(result["environment"]["name"], result["method"], result["seed"])
         if fields:
-            content = io.BytesIO()
-            np.savez_compressed(content, **fields)  # type: ignore[arg-type]
-            write_atomically(path.with_suffix(".npz"), content.getvalue())
+            with atomic_path(path.with_suffix(".npz")) as temporary, temporary.open("wb") as file:
+                np.savez_compressed(file, **fields)  # type: ignore[arg-type]
         write_atomically(path, json.dumps(result, indent=1, allow_nan=False).encode())
 
     def has_result(self, environment: str, method: str, seed: int, identity: str) -> bool:

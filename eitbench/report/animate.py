@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -14,7 +13,7 @@ from PIL import Image
 from threadpoolctl import threadpool_limits
 
 from eitbench import _check
-from eitbench._files import write_atomically
+from eitbench._files import atomic_path
 from eitbench.bench.methods import Method
 from eitbench.bench.run import isolated_job
 from eitbench.bench.tracks import Environment
@@ -60,9 +59,8 @@ def animate(environment: str, methods: Sequence[str], seed: str, step: int | Non
     if step is None:
         options |= {"save_all": True, "append_images": frames[1:], "loop": 0,
                     "duration": every * 1000 // env.metadata["render_fps"]}
-    content = io.BytesIO()
-    frames[0].save(content, path.suffix[1:], **options)
-    write_atomically(path, content.getvalue())
+    with atomic_path(path) as temporary:
+        frames[0].save(temporary, path.suffix[1:], **options)
     return path
 
 
