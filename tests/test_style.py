@@ -10,7 +10,7 @@ import pytest
 ROOT = Path(__file__).parent.parent
 PACKAGE = ROOT / "eitbench"
 BUDGETS = {"numerics": 1676, "scoring": 205, "physics": 1716, "worlds": 2782, "data": 1505, "estimation": 6885,
-           "measured": 2100, "envs": 1686, "bench": 4745, "report": 2750, "rl": 874, "cli": 1013}
+           "measured": 2100, "envs": 1686, "bench": 4672, "report": 2680, "rl": 874, "cli": 975}
 """Package (or module) -> lines of Python allowed, blank lines and docstrings included. Each imports only from those
 before it."""
 TOP = 436
