@@ -19,7 +19,7 @@ from eitbench.bench.measured import MeasuredRun
 from eitbench.bench.methods import Method, load_method
 from eitbench.bench.scores import LOST_DISTANCE, N_SECTIONS, Outcome
 from eitbench.bench.tracks import Environment, check_track, is_measured, subtrack_of
-from eitbench.data.episode_cache import region_operators, truth_mesh
+from eitbench.data.episode_cache import score_operators, truth_mesh
 from eitbench.data.episodes import cached_truth_model, simulate
 from eitbench.data.seeds import allow_test_seeds
 from eitbench.envs.estimation import EstimationEnv
@@ -129,7 +129,7 @@ def functionals_of(env: EstimationEnv) -> tuple[np.ndarray, np.ndarray] | None:
     if not (isinstance(model, ConvectionDiffusion) and isinstance(truth, ConvectionDiffusion)
             and model.inlet.size):
         return None
-    interpolation, mass = region_operators(env.world)
+    interpolation, mass = score_operators(env.world)
     points = truth_mesh(env.world).points
     along = points[:, 0 if points.shape[1] == 2 else 2]
     edges = np.linspace(along.min(), along.max(), N_SECTIONS + 1)
@@ -200,7 +200,7 @@ class EstimatorOutput:
     def outcome(self, env: EstimationEnv) -> Outcome:
         """Return the outcome of the episode that has just ended in ``env``."""
         task = env.task
-        interpolation, mass = region_operators(env.world)
+        interpolation, mass = score_operators(env.world)
         states = slice(task.warm_up, None)
         truth = env.truth()[states]
         mean = (interpolation @ self.means[states].T).T
@@ -287,7 +287,7 @@ def _run_policy(env: InjectionEnv, policy: Method, seed: int) -> EpisodeRun:
             distances = scoring.matched_distances(bodies[..., :2], centres, present)
         ospa = scoring.ospa(bodies[..., :2], bodies[..., -1] >= 0.5, centres, present,
                             LOST_DISTANCE)
-    interpolation, mass = region_operators(world)
+    interpolation, mass = score_operators(world)
     used = [each for each in innovations if each is not None]       # None: all were rejected
     outcome = Outcome(
         world, seconds / env.core.length, np.array(errors),

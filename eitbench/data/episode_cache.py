@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import lru_cache
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import scipy.sparse as sp
@@ -128,9 +128,9 @@ def is_episode_cached(world: World, seed: int) -> bool:
 
 def build_cached_episode(world: World, episode: Episode) -> np.ndarray:
     """Compute the entries of a cached episode from a simulated one or its prefix."""
-    operators = {"": score_operators(world)}
+    operators = {"": _score_operators(world.vessel, None)}
     if world.region is not None:
-        operators["region_"] = region_operators(world)
+        operators["region_"] = score_operators(world)
     entries = np.zeros(len(episode.noise), step_dtype(world, operators[""][0].shape[1]))
     entries["transfer_resistance"] = episode.transfer_resistance
     entries["noise"] = episode.noise
@@ -261,7 +261,8 @@ def scoring_constants_file(world: World) -> cache.File:
         task = make_task(world.truth_config)
         homogeneous = np.full(task.mesh.n_nodes, world.expected_concentration)
         largest = np.abs(task.observation.voltages(homogeneous, world.truth_config.currents)).max()
-        return _half_mass(*score_operators(world)) | {"largest": np.array(largest)}
+        mass = _half_mass(*_score_operators(world.vessel, None))
+        return mass | {"largest": np.array(largest)}
 
     instrument = Instrument(current=world.instrument.current)
     config = cache.config_dict(replace(world.truth_config, instrument=instrument))
@@ -282,7 +283,7 @@ def region_file(world: World) -> cache.File:
     """Return the file of the mass matrix of a world's region."""
     configuration = [cache.config_dict(world.vessel), world.region]
     key = cache.model_key("region", configuration, SCORING_VERSION)
-    return cache.File(key, lambda: _half_mass(*region_operators(world)))
+    return cache.File(key, lambda: _half_mass(*score_operators(world)))
 
 
 def truth_mesh(world: World) -> Mesh:
@@ -296,24 +297,19 @@ def _truth_mesh(vessel: Vessel) -> Mesh:
 
 
 def score_operators(world: World) -> tuple[sp.csr_array, sp.csr_array]:
-    """Return P and M over the whole vessel."""
-    return _score_operators(world.vessel)
+    """Return P and M over the scored region."""
+    return _score_operators(world.vessel, world.region)
 
 
 @lru_cache(maxsize=4)
-def _score_operators(vessel: Vessel) -> tuple[sp.csr_array, sp.csr_array]:
+def _score_operators(vessel: Any, region: tuple[float, float] | None,
+                     ) -> tuple[sp.csr_array, sp.csr_array]:
     from eitbench.numerics.fem import mass_matrix
-    truth, model = (vessel.transport_mesh(fine)[0] for fine in (True, False))
+    truth = _truth_mesh(vessel)
+    if region is not None:
+        return _score_operators(vessel, None)[0], mass_between(truth, *region)
+    model = vessel.transport_mesh(fine=False)[0]
     return model.interpolation_to(truth.points), mass_matrix(truth)
-
-
-@cache_per_truth
-def region_operators(world: World) -> tuple[sp.csr_array, sp.csr_array]:
-    """Return P and M over the scored region."""
-    interpolation, mass = score_operators(world)
-    if world.region is not None:
-        mass = mass_between(truth_mesh(world), *world.region)
-    return interpolation, mass
 
 
 def mass_between(mesh: Mesh, begin: float, end: float) -> sp.csr_array:

@@ -19,7 +19,7 @@ from eitbench.bench.runner import is_compatible, iter_estimates, iter_injections
 from eitbench.bench.scores import scores
 from eitbench.bench.text import mean_and_interval
 from eitbench.bench.tracks import subtrack_of
-from eitbench.data.episode_cache import region_operators, truth_mesh
+from eitbench.data.episode_cache import score_operators, truth_mesh
 from eitbench.data.episodes import simulate
 from eitbench.data.seeds import format_seed, parse_seeds
 from eitbench.envs.injection import InjectionEnv
@@ -97,7 +97,7 @@ def episode(method: Any, env: str | gym.Env, seed: int | str, *,
     wanted = list(map(int, np.linspace(world_of.warm_up + 1, world_of.n_steps, times + 2)[1:-1]))
     found = states_at(made, loaded, number, wanted)
     mesh = truth_mesh(world_of)
-    interpolation, mass = region_operators(world_of)
+    interpolation, mass = score_operators(world_of)
     task = made.task
     figure, axes = plt.subplots(times, 2, figsize=_size(task, times, 2), squeeze=False,
                                 sharex=True, sharey=True, layout="constrained")

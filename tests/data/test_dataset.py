@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import torch
 import yaml
-from eitbench.data.episode_cache import cached_episode, integrals, region_operators, score_mass, step_error
+from eitbench.data.episode_cache import cached_episode, integrals, score_mass, score_operators, step_error
 from eitbench.data.episodes import simulate
 from eitbench.data.export import export
 
@@ -52,7 +52,7 @@ def test_truth_is_the_best_there_is_on_these_nodes(env, changes):
     examples = eitbench.dataset(env, "train:0", world=changes)
     (example,) = examples
     truth = simulate(examples.world, 0).concentration[1:].astype(float)
-    interpolation, mass = region_operators(examples.world)
+    interpolation, mass = score_operators(examples.world)
     off = (truth - example.truth @ interpolation.T).T
     weights = mass.sum(axis=0) @ interpolation
     assert np.abs(interpolation.T @ (mass @ off)).max() < 1e-5 * weights.max() * np.abs(off).max()

@@ -11,8 +11,8 @@ from eitbench.data.episode_cache import (
     integrals,
     integrate,
     mass_between,
-    region_operators,
     score_mass,
+    score_operators,
     scoring_constants,
 )
 from eitbench.data.presimulation import presimulate
@@ -57,7 +57,7 @@ def test_recordings_hold_the_integrals(monkeypatch, tmp_path):
     narrow = {"flow": {"velocity_range": [44.5, 45.5]}, "schedule": {"scored_steps": 3}}
     world = PIPE_2D_DRIFTING.with_changes(WANDERING).with_changes(narrow)
     assert presimulate(world, [1, 2]) == 2
-    made = integrate(eitbench.simulate(world, 2, cache=False), world.background, *region_operators(world))
+    made = integrate(eitbench.simulate(world, 2, cache=False), world.background, *score_operators(world))
     np.testing.assert_equal(integrals(world, cached_episode(world, 2)), made)
 
 
