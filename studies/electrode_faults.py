@@ -50,6 +50,18 @@ class KnownFaults(ElectrodeFaults):
         return self.flow_probability(currents != 0.0) == 1.0
 
 
+class FiltersWithKnownFaults(ReducedFilters):
+    """Reduced filters that are given the true faults of the episodes."""
+
+    def __init__(self, rules: Rules, frames: np.ndarray, faults: Faults) -> None:
+        self._known = KnownFaults(rules.instrument, rules.world.n_steps, faults)
+        super().__init__(rules, frames)
+
+    def _start(self, episodes: int) -> None:
+        self.faults = self._known
+        super()._start(episodes)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description="Scores by treatment of electrode faults.")
     parser.add_argument("--seeds", default="dev:0-31")
@@ -78,8 +90,7 @@ def error(rules: Rules, policy: str, seed: int, is_told: bool) -> float:
     count = len(rules.pairs) if policy == BEST else 1
     core.reset([seed] * count)
     if is_told:
-        faults = KnownFaults(rules.instrument, rules.world.n_steps, core.faults)
-        core._filters = ReducedFilters(rules, core._frames, faults)
+        core._filters = FiltersWithKnownFaults(rules, core._frames, core.faults)
     scored = []
     if policy != BEST:
         agent: Any = load_method(policy, "injection").make(rules, np.random.default_rng(seed))

@@ -8,7 +8,7 @@ from collections.abc import Iterable, Iterator
 from eitbench.bench.tracks import builtin_ids
 from eitbench.data.cache import File, ship
 from eitbench.data.episode_cache import prefix_file, region_file, scoring_constants_file
-from eitbench.estimation.onboard.models import build_packed_model, reduced_model_key
+from eitbench.estimation.onboard.models import model_file
 from eitbench.worlds.bodies import MovingBody
 from eitbench.worlds.registry import Entry, entries, entry
 
@@ -30,7 +30,7 @@ def _files(registered: Entry) -> Iterator[File]:
     if needed <= world.warm_up:
         yield prefix_file(world, needed)
     if registered.track == "injection" and not isinstance(world.target, MovingBody):
-        yield File(reduced_model_key(world), lambda: build_packed_model(world.fault_free))
+        yield model_file(world)
 
 
 def write_package_data() -> Iterator[str]:

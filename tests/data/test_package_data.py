@@ -8,7 +8,7 @@ from eitbench.bench.tracks import builtin_ids
 from eitbench.data import cache, episodes
 from eitbench.data.cache import load_shipped
 from eitbench.data.episode_cache import csr_of, prefix_file, region_file, scoring_constants_file
-from eitbench.estimation.onboard.models import pack_model, reduced_model_key, unpack_model
+from eitbench.estimation.onboard.models import model_file, pack_model, unpack_model
 from eitbench.estimation.reduced import ReducedModel
 from eitbench.worlds import entry
 
@@ -78,7 +78,7 @@ def test_models_are_compared_in_one_basis():
       {"instrument": {"current": 0.2}}]),
     (lambda world: region_file(world).key,
      [{"schedule": {"scored_steps": 3}}], [{"region": [0.1, 0.2]}, {"vessel": {"electrodes_per_wall": 4}}]),
-    (reduced_model_key,
+    (lambda world: model_file(world).key,
      [{"schedule": {"budget": 3, "scored_steps": 9}}, {"instrument": {"n_dead_range": [1, 1]}}],
      [{"instrument": {"noise_relative": 0.1}}, {"prior": {"nodal_std": 0.1}}, {"flow": {"mean_velocity": 4.0}},
       {"schedule": {"time_step": 4e-3}}, {"vessel": {"electrodes_per_wall": 4}}])])

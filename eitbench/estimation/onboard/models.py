@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
 from threadpoolctl import threadpool_limits
 
 from eitbench._notice import notify
-from eitbench.data.cache import Key, cached, config_dict, model_key
+from eitbench.data.cache import File, cached, config_dict, model_key
 from eitbench.estimation.covariance import LowRankCovariance, OpenLoopCovariance
 from eitbench.estimation.filter import Filter
 from eitbench.estimation.gaussian import LinearisedForwardModel, LinearMeasurement
@@ -112,35 +112,28 @@ def load_or_build_learned(world: World) -> tuple[InflowModel, NodeVoltages]:
 
 
 def load_or_build_model(world: World) -> ReducedModel | JointModel:
-    """Return the reduced model with a white inflow, rounded to single precision; building it takes
-    half a minute."""
-    key = reduced_model_key(world)
+    """Return the reduced model with a white inflow, rounded to single precision."""
+    kind = ReducedModel if world.velocity_model is None else JointModel
+    return kind(**unpack_model(cached(*model_file(world))))
+
+
+def model_file(world: World) -> File:
+    """Return the file of the reduced model with a white inflow, which depends neither on the target
+    nor on the number of steps; building it takes half a minute."""
+    name, make_model = (("reduced", build_steady_model) if world.velocity_model is None else
+                        ("joint", build_joint_model))
+    sound = config_dict(world.fault_free)
+    numbers = {part: sound[part] for part in ("vessel", "flow", "instrument", "prior")}
+    schedule = {part: sound["schedule"][part] for part in ("pattern", "time_step")}
+    key = model_key(name, numbers | schedule, WHITE_MODEL_VERSION)
 
     def build() -> dict[str, np.ndarray]:
         notify(f"building the reduced filter of {world.name}, about half a minute; it is cached in "
                f"{key.path.parent}")
-        return build_packed_model(world)
+        with threadpool_limits(1):                              # for reproducible rounding
+            return pack_model(make_model(world.fault_free))
 
-    kind = ReducedModel if world.velocity_model is None else JointModel
-    return kind(**unpack_model(cached(key, build)))
-
-
-def reduced_model_key(world: World) -> Key:
-    """Return the key of a reduced model, which depends neither on the target nor on the number of
-    steps."""
-    sound = config_dict(world.fault_free)
-    numbers = {part: sound[part] for part in ("vessel", "flow", "instrument", "prior")}
-    schedule = {part: sound["schedule"][part] for part in ("pattern", "time_step")}
-    name = "reduced" if world.velocity_model is None else "joint"
-    return model_key(name, numbers | schedule, WHITE_MODEL_VERSION)
-
-
-def build_packed_model(world: World) -> dict[str, np.ndarray]:
-    """Build a model on one thread, for reproducible rounding, and return its stored form."""
-    make: Callable[[World], Any] = (build_steady_model if world.velocity_model is None
-                                    else build_joint_model)
-    with threadpool_limits(1):
-        return pack_model(make(world))
+    return File(key, build)
 
 
 def pack_model(model: NamedTuple) -> dict[str, np.ndarray]:

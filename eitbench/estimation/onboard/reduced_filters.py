@@ -174,6 +174,4 @@ class SharedData:
         return _shared(rules.world.fault_free, rules.inflow)
 
 
-@lru_cache(maxsize=4)
-def _shared(world: World, inflow: str) -> SharedData:
-    return SharedData(world, inflow)
+_shared = lru_cache(maxsize=4)(SharedData)
