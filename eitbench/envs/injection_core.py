@@ -64,13 +64,8 @@ class InjectionCore(EpisodeCore):
     """B episodes: injections in, noisy voltages out; the reward is the error of the homogeneous
     estimate minus the error of a filter.
 
-    Parameters
-    ----------
-    rules : Rules
-    estimator : str
-        One of `eitbench.estimation.onboard.full_filters.ESTIMATOR_OPTIONS`.
-    observation : str
-        One of `OBSERVATION_FORMATS`; without an estimator observations are raw.
+    ``estimator`` is one of `eitbench.estimation.onboard.full_filters.ESTIMATOR_OPTIONS`, and
+    ``observation`` one of `OBSERVATION_FORMATS`; without an estimator observations are raw.
     """
 
     def __init__(self, rules: Rules, estimator: str, observation: str = "raw") -> None:

@@ -26,13 +26,7 @@ class AgentPolicy:
     A scored run gives a policy a raw observation, with the estimates of the full filter. `act`
     replaces it by the scaled observation (d,) float32 of the environment in which the agent was
     trained, with its filter, and passes it to `choose`, which subclasses define. Injections so do
-    not depend on the filter of the environment.
-
-    Parameters
-    ----------
-    rules : Rules
-    random : numpy.random.Generator
-        For policies that draw actions.
+    not depend on the filter of the environment. ``random`` is for policies that draw actions.
     """
 
     estimator: ClassVar[str] = "reduced"

@@ -8,8 +8,7 @@ from matplotlib.figure import Figure
 
 from eitbench.data.episode_cache import truth_mesh
 from eitbench.envs.estimation import EstimationEnv
-from eitbench.envs.isosurface import draw_isosurfaces
-from eitbench.envs.rendering import colour_range, draw_field
+from eitbench.envs.rendering import colour_range, draw_field, draw_isosurfaces
 
 from .common import (
     agreement_line,

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from eitbench.envs.isosurface import isosurface
+from eitbench.envs.rendering import isosurface
 from eitbench.numerics.round_meshes import extrude, uniform_disc
 
 MESH = extrude(uniform_disc(1.0, 8), np.linspace(-1.0, 1.0, 17))

@@ -110,13 +110,6 @@ class Belief:
     state is reduced (120 coordinates), relative to c_ref, with the mass matrix as the identity: the
     trace of its covariance is the expected squared error, integrated. If the velocity is estimated,
     the mean velocity (m/s) is the last of the s entries.
-
-    Parameters
-    ----------
-    rules : Rules
-        Rules of the environment.
-    observation : dict
-        First raw observation.
     """
 
     def __init__(self, rules: Rules, observation: dict[str, np.ndarray]) -> None:

@@ -43,8 +43,7 @@ from eitbench.estimation.reduced import (
     reduced_model,
 )
 from eitbench.numerics.fem import mass_matrix
-from eitbench.physics.profiles import VelocityModel
-from eitbench.worlds.task import Task, make_task
+from eitbench.worlds.task import make_task
 from eitbench.worlds.world import World
 
 VELOCITY_BOUNDS = (1 / 3, 2.0)
@@ -76,7 +75,8 @@ def reduced_states(world: World, inflow: str) -> tuple[ReducedStates, ReducedSta
     model = load_or_build_model(world)
     if isinstance(model, ReducedModel):
         return SteadyStates(model), SteadyStates(single_precision(model))
-    flow = require_scalar_velocity(make_task(world))
+    flow = make_task(world).velocity
+    assert flow is not None
     bounds = (VELOCITY_BOUNDS[0] * flow.nominal[0], VELOCITY_BOUNDS[1] * flow.nominal[0])
     how = flow.nominal[0], flow.initial_std[0], flow.walk_std[0], bounds
     return JointStates(model, *how), JointStates(single_precision(model), *how)
@@ -169,9 +169,13 @@ def build_steady_model(world: World) -> ReducedModel:
 
 
 def build_joint_model(world: World) -> JointModel:
-    """Return the model of an unknown mean velocity in double precision, in about 45 s."""
+    """Return the model of an unknown mean velocity in double precision, in about 45 s;
+    ``ValueError`` unless the flow has one unknown parameter."""
     task = make_task(world)
-    flow = require_scalar_velocity(task)
+    flow = task.velocity
+    if flow is None or flow.n_parameters != 1:
+        raise ValueError("world must have a flow with one unknown parameter, its mean velocity, "
+                         f"got {flow!r}")
     mass = mass_matrix(task.mesh).toarray()
     record = _random_pair_measurements(world, 45)
 
@@ -189,14 +193,6 @@ def build_joint_model(world: World) -> JointModel:
     velocities = np.linspace(*VELOCITY_BOUNDS, N_TABULATED_VELOCITIES) * flow.nominal[0]
     return joint_model(basis, mass, initial_covariance(task.mesh, task.prior), velocities,
                        map(motion, velocities))
-
-
-def require_scalar_velocity(task: Task) -> VelocityModel:
-    """Return the velocity model; ``ValueError`` unless it has one parameter."""
-    if task.velocity is None or task.velocity.n_parameters != 1:
-        raise ValueError("world must have a flow with one unknown parameter, its mean velocity, "
-                         f"got {task.velocity!r}")
-    return task.velocity
 
 
 def _random_pair_measurements(world: World, length: int) -> list[LinearMeasurement]:
