@@ -39,7 +39,7 @@ def parts_of_error(env: Any, policy: str) -> np.ndarray:
             observation, *_ = env.step(acting.act(observation))
             if t <= core.world.warm_up:
                 continue
-            distance = np.linalg.norm(core.bodies()[0, 0, :2] - body.centres[t])
+            distance = np.linalg.norm(core.filters.bodies()[0, 0, :2] - body.centres[t])
             is_new = not body.present[max(t - NEW_STEPS, 0):t + 1].all()
             part = (0 if not body.present[t] else
                     1 if is_new else 2 + int(np.searchsorted(LIMITS, distance)))
@@ -54,7 +54,7 @@ def image_error(env: Any) -> float:
     for seed in parse_seeds(SEEDS):
         env.reset(seed=seed)
         body = path_of(core)
-        filters = core._filters.filter
+        filters = core.filters.filter
         core.load_until(core.world.n_steps)
         for t in range(core.world.warm_up + 1, core.world.n_steps + 1):
             for values, true in zip(filters.particles, (

@@ -90,7 +90,7 @@ def error(rules: Rules, policy: str, seed: int, is_told: bool) -> float:
     count = len(rules.pairs) if policy == BEST else 1
     core.reset([seed] * count)
     if is_told:
-        core._filters = FiltersWithKnownFaults(rules, core._frames, core.faults)
+        core.filters = FiltersWithKnownFaults(rules, core._frames, core.faults)
     scored = []
     if policy != BEST:
         agent: Any = load_method(policy, "injection").make(rules, np.random.default_rng(seed))

@@ -87,7 +87,7 @@ def error(rules: Rules, policy: str, seed: int) -> float:
     scored = []
     for k in range(core.length):
         if policy == GREEDY:
-            pair = greedy_pair(core._filters)
+            pair = greedy_pair(core.filters)
         elif policy == CYCLE:
             pair = rules.pairs.tolist().index(PAIRS[k % len(PAIRS)])
         else:

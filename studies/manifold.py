@@ -79,7 +79,7 @@ def errors(rules: Rules, n_pipes: int, policy: str) -> np.ndarray:
             alarm, bonus = (float(policy.split()[i]) for i in (2, 4))
             index = age + bonus * (surprise > alarm)
         else:
-            total, gain = predicted(core._filters, rules.action_currents[pair])
+            total, gain = predicted(core.filters, rules.action_currents[pair])
             index = gain if "gain" in policy else total
         if policy.startswith("Whittle"):
             index = steps * total - cost
@@ -92,7 +92,7 @@ def errors(rules: Rules, n_pipes: int, policy: str) -> np.ndarray:
         core.act(actions)
         age += 1.0
         age[chosen] = 0.0
-        innovations = core._filters.features()["innovations"][chosen]
+        innovations = core.filters.features()["innovations"][chosen]
         surprise[chosen] = np.sqrt((innovations**2).mean(axis=1))
         slug = PRIOR + PERSISTENCE * (slug - PRIOR)
         ratio = surprise[chosen]**2 * (1.0 - 1.0 / SLUG_VARIANCE) - np.log(SLUG_VARIANCE)

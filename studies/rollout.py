@@ -43,7 +43,7 @@ class Rollout(BeliefPolicy):
     def pair(self, observation: dict[str, np.ndarray]) -> int:
         candidates = np.argsort(-self.belief.criteria()[0])[:CANDIDATES]
         pairs = np.repeat(candidates, BODIES)
-        inner, random = self.belief._filters.filter, self.random
+        inner, random = self.belief.filters.filter, self.random
         model = inner.model
         moved, weights = model.move(inner.particles, inner.weights, random)
         drawn = random.choice(inner.n_particles, BODIES, p=weights[0])
@@ -60,14 +60,14 @@ class Rollout(BeliefPolicy):
             voltages = simulated_voltages(model, bodies, currents, random)
             filters.assimilate(voltages, currents,
                                self.rules.instrument.measurement_mask(currents))
-            cost += filters.variance(self.belief._filters.patches).sum(axis=1)
+            cost += filters.variance(self.belief.filters.patches).sum(axis=1)
         return int(candidates[cost.reshape(CANDIDATES, BODIES).mean(axis=1).argmin()])
 
     def _greedy(self, filters: BodyParticleFilter, b: int) -> int:
         """Return the pair of `greedy_a` in the b-th episode of the filters."""
         belief = copy(self.belief)
-        belief._filters = copy(self.belief._filters)
-        belief._filters.filter = filters
+        belief.filters = copy(self.belief.filters)
+        belief.filters.filter = filters
         return int(belief.criteria(b)[0].argmax())
 
 

@@ -30,7 +30,7 @@ def make(estimator: str = "none", name: str = NAME, observation: str = "raw", lo
 
 def filter_of(whose):
     """Return the filters of an injection environment, or of a policy's belief."""
-    return (whose.unwrapped.core if isinstance(whose, gym.Env) else whose)._filters
+    return (whose.unwrapped.core if isinstance(whose, gym.Env) else whose).filters
 
 
 def play(env: gym.Env, seed: int, actions: np.ndarray) -> list[tuple]:

@@ -270,8 +270,8 @@ def _run_policy(env: InjectionEnv, policy: Method, seed: int) -> EpisodeRun:
         actions.append(action)
         if (error := env.error) is not None:
             means, stds = env.core.estimate()
-            scored.append((t, error, means[0], stds[0], env.core.innovations()[0],
-                           env.core.bodies()))
+            scored.append((t, error, means[0], stds[0], env.core.filters.innovations()[0],
+                           env.core.filters.bodies()))
     states, errors, mean, std, innovations, estimates = zip(*scored, strict=True)
     world = env.core.world
     distances = ospa = areas = None

@@ -11,7 +11,7 @@ from gymnasium import spaces
 from eitbench import _check
 from eitbench.data.episode_cache import instrument_faults, integrals, score_mass, scoring_constants
 from eitbench.envs.episodes import EpisodeCore, Observation
-from eitbench.estimation.onboard.episode_filters import BODY, Innovation
+from eitbench.estimation.onboard.episode_filters import BODY
 from eitbench.estimation.onboard.full_filters import filters_class
 from eitbench.estimation.onboard.rules import Rules
 from eitbench.worlds.instrument import Faults
@@ -144,7 +144,6 @@ class InjectionCore(EpisodeCore):
         """V and A (A/m in 2D), (B, L) each, of the last injections"""
         self._recent = np.zeros((B, N_RECENT_CURRENTS, L))
         self._waited = np.zeros(B, dtype=int)
-        self._homogeneous: np.ndarray | None = None
         self._errors: np.ndarray | None = None
         faults = [instrument_faults(world, seed) for seed in seeds]
         self.faults = Faults(*(np.array(part) for part in zip(*faults, strict=True)))
@@ -154,11 +153,12 @@ class InjectionCore(EpisodeCore):
             return
         self._frames = np.stack([self._measure(k, np.repeat(cycle[None], B, axis=0))
                                  for k, cycle in enumerate(world.currents)], axis=1)
-        self._filters = self._filters_type(self.rules, self._frames)
+        self.filters = self._filters_type(self.rules, self._frames)
+        """filters of the episodes; for scores and oracles, not for agents"""
         self._voltages = self._frames[:, -1].copy()
         self.currents = np.repeat(world.currents[-1:], B, axis=0)
-        for k in range(N_RECENT_CURRENTS):
-            self._recent[:, k] = world.currents[(self.n_initial - 1 - k) % self.n_initial]
+        self._recent[:] = world.currents[(-1 - np.arange(N_RECENT_CURRENTS)) % self.n_initial]
+        self._area = score_mass(world).sum()
 
     def _read(self, recordings: Sequence[np.ndarray]) -> None:
         moments = []
@@ -176,17 +176,13 @@ class InjectionCore(EpisodeCore):
                 moment[k] = counted.moment[k]
                 moments.append(self._filters_type.project(self.rules, moment))
         self._moments = np.array(moments)
-        self._homogeneous = None
 
     def homogeneous_errors(self) -> np.ndarray:
-        """Return the relative errors (B, loaded steps) of the homogeneous estimates."""
-        if self._homogeneous is None:
-            level = self._filters.c_ref[:, None] - self.world.background
-            area = score_mass(self.world).sum()
-            k = slice(self._known)
-            error = area * level**2 - 2.0 * level * self._totals[:, k] + self._deviations[:, k]
-            self._homogeneous = error / self._squares[:, k]
-        return self._homogeneous
+        """Return the relative errors (B,) of the homogeneous estimates of the present state."""
+        k = self.t - 1
+        level = self.filters.c_ref - self.world.background
+        error = self._area * level**2 - 2.0 * level * self._totals[:, k] + self._deviations[:, k]
+        return np.asarray(error / self._squares[:, k])
 
     def _measure(self, k: int, currents: np.ndarray,
                  electrodes: np.ndarray | None = None) -> np.ndarray:
@@ -227,10 +223,10 @@ class InjectionCore(EpisodeCore):
         self.t += 1
         if not self._filters_type:
             return np.zeros(len(currents))
-        self._filters.assimilate(self._voltages, currents)
+        self.filters.assimilate(self._voltages, currents)
         if self.t <= self.world.warm_up:
             return np.zeros(len(currents))
-        rewards = self.homogeneous_errors()[:, self.t - 1] - self.errors()
+        rewards = self.homogeneous_errors() - self.errors()
         if not np.isfinite(rewards).all():
             broken = [seed for seed, reward in zip(self.seeds, rewards, strict=True)
                       if not np.isfinite(reward)]
@@ -245,7 +241,7 @@ class InjectionCore(EpisodeCore):
             return np.full(len(self.n_injections), np.nan)
         if self._errors is None:
             k = self.t - 1
-            self._errors = self._filters.errors(self._moments[:, k], self._deviations[:, k],
+            self._errors = self.filters.errors(self._moments[:, k], self._deviations[:, k],
                                                 self._squares[:, k])
         return self._errors
 
@@ -256,7 +252,7 @@ class InjectionCore(EpisodeCore):
         k = self.t
         self.load_until(k + 1)
         currents = self.rules.currents(actions)
-        trial = self._filters.repeat(len(actions))
+        trial = self.filters.repeat(len(actions))
         trial.assimilate(self.rules.instrument.measure(
             self.faults, k + 1, self._resistance[k], currents, np.zeros_like(currents),
             self.rules.electrodes(actions)), currents)
@@ -268,20 +264,11 @@ class InjectionCore(EpisodeCore):
         if not self._filters_type:
             shape = (len(self.n_injections), scoring_constants(self.world).mass.shape[0])
             return np.full(shape, self.world.expected_concentration), np.zeros(shape)
-        return self._filters.means(), self._filters.stds()
+        return self.filters.means(), self.filters.stds()
 
     def picture(self, b: int) -> tuple[int, np.ndarray, np.ndarray | None, np.ndarray]:
         means, stds = self.estimate()
         return self.t, means[b], stds[b], self.currents[b]
-
-    def innovations(self) -> list[Innovation | None]:
-        """Return each episode's innovation of the last accepted measurements, for scores, not for
-        agents; None without an injection or an accepted measurement."""
-        return self._filters.innovations()
-
-    def bodies(self) -> np.ndarray | None:
-        """Return the estimated `BODY` of each body in each episode (B, bodies, 9); None without."""
-        return self._filters.bodies()
 
     def action_masks(self) -> np.ndarray:
         """Return (B, actions) bool as `Rules.action_masks` does."""
@@ -294,7 +281,7 @@ class InjectionCore(EpisodeCore):
         shown = {"voltages": np.nan_to_num(self._voltages), "currents": self.currents.copy()}
         if self._filters_type:
             shown |= {"recent": self._recent.copy(), "frame": np.nan_to_num(self._frames)}
-            shown |= self._filters.features()
+            shown |= self.filters.features()
             if self.rules.history == "injections":
                 shown["waited"] = self._waited[:, None].astype(float)
         left = [np.full(len(self.n_injections), float(self.world.n_steps - self.t))]

@@ -36,7 +36,7 @@ def again(name: str, currents: np.ndarray) -> dict[str, list]:
         for key, value in (("error", env.error), ("mean", mean), ("std", std),
                            ("truth", truth[len(env.world.currents) + k + 1])):
             seen[key].append(value)
-        if (innovation := env.core.innovations()[0]) is not None:
+        if (innovation := env.core.filters.innovations()[0]) is not None:
             value, covariance = innovation
             seen["nis"].append(value @ np.linalg.inv(covariance) @ value / len(value))
     return seen

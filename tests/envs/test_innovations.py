@@ -30,7 +30,7 @@ def test_innovations_are_those_of_the_tasks_matrices(name, estimator):
     env = make(estimator, name).unwrapped
     env.reset(seed=5)
     core, task, rules = env.core, env.task, env.rules
-    operator = core._filters
+    operator = core.filters
     n = task.mesh.n_nodes
     level = operator.c_ref[0]
     basis = operator.shared.states.basis if estimator == "reduced" else np.eye(n)
@@ -40,7 +40,7 @@ def test_innovations_are_those_of_the_tasks_matrices(name, estimator):
         mean, times = predicted(before, estimator, n)
         resting = name == BUDGET and k == 1
         observation = env.step(rules.action(None if resting else int(pair)))[0]
-        said = core.innovations()[0]
+        said = core.filters.innovations()[0]
         if resting:
             assert said is None
             continue

@@ -55,7 +55,7 @@ def test_filter_is_the_full_one_of_a_baseline(name, estimator):
             continue
         np.testing.assert_allclose(mean, expected.mean, rtol=1e-7)
         np.testing.assert_allclose(spread**2, expected.variance, rtol=1e-5, atol=1e-9)
-        (innovation,) = env.core.innovations()
+        (innovation,) = env.core.filters.innovations()
         np.testing.assert_allclose(innovation.value, step.innovation, rtol=1e-6, atol=1e-10)
         np.testing.assert_allclose(innovation.covariance, step.innovation_covariance, rtol=1e-6, atol=1e-14)
         if name == FLOW:

@@ -70,7 +70,7 @@ def test_weights_are_those_of_bayes_formula(id, monkeypatch):
     """One measurement from equal weights: the likelihood of each particle's voltages at the measured electrodes,
     relative to the density of the noise, and the moments of the innovation. Signals of bodies add up."""
     core, _ = believed(id)
-    filters, rules = core._filters.filter, core.rules
+    filters, rules = core.filters.filter, core.rules
     model = filters.model
     monkeypatch.setattr(model, "move", lambda particles, weights, random: (
         particles, np.full_like(weights, 1.0 / weights.size)))
@@ -89,7 +89,7 @@ def test_weights_are_those_of_bayes_formula(id, monkeypatch):
     residuals = core._voltages[0, measured] - base[measured] - signals
     expected = -0.5 * (residuals**2 / variances + np.log(variances / std**2)).sum(axis=1)
     np.testing.assert_allclose(found[0], softmax(expected), rtol=1e-9)
-    (innovation,) = core.innovations()
+    (innovation,) = core.filters.innovations()
     np.testing.assert_allclose(innovation.value, residuals.mean(axis=0), rtol=1e-9, atol=1e-12)
     S = np.cov(residuals.T, bias=True) + np.diag(variances.mean(axis=0))
     np.testing.assert_allclose(innovation.covariance, S, rtol=1e-9, atol=1e-15)
@@ -100,12 +100,12 @@ def test_weights_are_those_of_bayes_formula(id, monkeypatch):
 def test_criteria_are_those_of_a_gaussian_of_images_and_voltages(id):
     """A-criterion: the decrease of the image's variances by conditioning; D-criterion: half log det of S R⁻¹."""
     _, belief = believed(id)
-    filters, rules = belief._filters.filter, belief.rules
+    filters, rules = belief.filters.filter, belief.rules
     model, random = filters.model, np.random.default_rng(1)
     gains, information = belief.criteria()
     particles, (w,) = model.move(filters.particles, filters.weights, random)
     index, share = (each[0] for each in model.cells(particles))
-    images = np.array([belief._filters.patches[:, index[p]] @ share[p] for p in range(len(w))])
+    images = np.array([belief.filters.patches[:, index[p]] @ share[p] for p in range(len(w))])
     changes = np.array([model.signals[:, index[p]] @ share[p] for p in range(len(w))]).reshape(-1, 16, 16)
     for pair in (0, 7, 57, 119):
         i, j = rules.pairs[pair]
@@ -173,7 +173,7 @@ def test_neighbours_can_be_chosen():
         np.testing.assert_array_equal(chosen.act(action[None]), fixed.act(np.array([pair])))
         np.testing.assert_array_equal(chosen._voltages, fixed._voltages)
         belief.update({name: array[0] for name, array in chosen.observe().items()})
-        np.testing.assert_array_equal(belief._filters.filter.weights, chosen._filters.filter.weights)
+        np.testing.assert_array_equal(belief.filters.filter.weights, chosen.filters.filter.weights)
 
 
 def test_only_chosen_electrodes_are_measured():
@@ -181,7 +181,7 @@ def test_only_chosen_electrodes_are_measured():
     core, _ = believed(CHOSEN)
     core.act(np.array([[0, 1, 7, 7, 12]]))
     assert np.flatnonzero(core.observe()["voltages"][0]).tolist() == [1, 7, 12]
-    assert core.innovations()[0].value.shape == (3,)
+    assert core.filters.innovations()[0].value.shape == (3,)
 
 
 def test_bodies_have_the_same_order_in_all_particles():
@@ -203,7 +203,7 @@ def test_bodies_have_the_same_order_in_all_particles():
 
 def test_body_has_the_moments_of_the_particles_that_are_present():
     core, _ = believed(SEARCH)
-    filters, random = core._filters.filter, np.random.default_rng(0)
+    filters, random = core.filters.filter, np.random.default_rng(0)
     filters.weights[:] = random.dirichlet(np.ones(filters.n_particles))
     filters.particles.present[0, :, 0] = random.uniform(size=filters.n_particles) < 0.3
     present = filters.particles.present[0, :, 0]
@@ -256,7 +256,7 @@ def test_belief_is_the_filter_inside(id):
     for pair in (7, 100, 3):
         core.act(np.array([pair]))
         belief.update({name: array[0] for name, array in core.observe().items()})
-        ours, inside = (each._filters.filter for each in (belief, core))
+        ours, inside = (each.filters.filter for each in (belief, core))
         np.testing.assert_equal(ours.particles, inside.particles)
         np.testing.assert_array_equal(ours.weights, inside.weights)
 

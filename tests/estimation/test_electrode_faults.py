@@ -107,7 +107,7 @@ def played() -> tuple[InjectionCore, np.ndarray]:
 def test_faults_of_the_environment_are_found(played):
     """At the end of an episode all broken wires and bad contacts are known; other electrodes are intact."""
     core, _ = played
-    probabilities = core._filters.faults.probabilities
+    probabilities = core.filters.faults.probabilities
     broken = core.faults.open_circuit_from <= core.t - 16               # measured since
     late = core.faults.open_circuit_from <= core.t
     loose = (core.faults.noise_factor > 1.0) & ~late
@@ -130,8 +130,8 @@ def test_full_filter_finds_the_same_faults(played):
     core, errors = played
     full, full_errors = play(RULES, SEEDS[:1], "full")
     assert np.nanmean(full_errors) == pytest.approx(np.nanmean(errors[:, 0]), rel=0.03)
-    np.testing.assert_allclose(full._filters.faults.probabilities[0],
-                               core._filters.faults.probabilities[0], atol=0.05)
+    np.testing.assert_allclose(full.filters.faults.probabilities[0],
+                               core.filters.faults.probabilities[0], atol=0.05)
 
 
 def test_an_episode_does_not_depend_on_the_others(played):
@@ -153,7 +153,7 @@ def test_without_faults_the_filter_is_the_plain_one() -> None:
 def test_criteria_avoid_broken_electrodes(played):
     core, _ = played
     belief = Belief(RULES, {name: array[0] for name, array in core.observe().items()})
-    probabilities = belief._filters.faults.probabilities
+    probabilities = belief.filters.faults.probabilities
     probabilities[0] = [1.0, 0.0, 0.0]
     before = belief.criteria()[0]
     probabilities[0, 3] = [0.0, 1.0, 0.0]
@@ -170,5 +170,5 @@ def test_open_inputs_may_measure_zero() -> None:
     quiet = replace(WORLD, instrument=replace(WORLD.instrument, interference=0.0))
     core, errors = play(Rules(quiet, inflow="learned", faults="estimated"), SEEDS[:1])
     broken = core.faults.open_circuit_from <= core.t - 16
-    assert core._filters.faults.probabilities[broken, BROKEN].min() > 0.99
+    assert core.filters.faults.probabilities[broken, BROKEN].min() > 0.99
     assert np.isfinite(errors[-1]).all()

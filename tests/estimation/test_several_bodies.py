@@ -37,7 +37,7 @@ def test_the_filter_follows_bubbles(world, limit):
         core.act(np.full(len(seeds), rules.pairs.tolist().index(([2, 9], [0, 7], [5, 9])[k % 3])))
         centres, present = (np.array([[getattr(path, name)[core.t] for path in own] for own in paths])
                             for name in ("centres", "present"))
-        distances += matched_distances(core.bodies()[..., :2], centres, present).tolist()
-    estimated = core.bodies()
+        distances += matched_distances(core.filters.bodies()[..., :2], centres, present).tolist()
+    estimated = core.filters.bodies()
     np.testing.assert_array_equal(core.observe()["body"].reshape(estimated.shape), estimated)
     assert len(distances) > 20 * world.target.n_bodies and np.median(distances) < limit

@@ -114,8 +114,8 @@ class Belief:
 
     def __init__(self, rules: Rules, observation: dict[str, np.ndarray]) -> None:
         self.rules = rules
-        self._filters = ReducedFilters(rules, observation["frame"][None])
-        self._shared = self._filters.shared
+        self.filters = ReducedFilters(rules, observation["frame"][None])
+        self._shared = self.filters.shared
         self._true_states: np.ndarray | None = None
         self._clear_cache()
         measuring, self._driving = observation["doubt"]
@@ -141,11 +141,11 @@ class Belief:
         rise. While an electrode is not driven, its score decays; a faulty one keeps a high score,
         since it measures interference.
         """
-        self._filters.assimilate(observation["voltages"][None], observation["currents"][None])
+        self.filters.assimilate(observation["voltages"][None], observation["currents"][None])
         self._true_states = None
         self._clear_cache()
         measuring, driving = observation["doubt"]
-        if self._filters.faults is None:
+        if self.filters.faults is None:
             driving = np.where(observation["currents"] == 0.0, FAULT_DECAY * self._driving, driving)
         self._driving = driving
         self.fault_score = measuring + self._driving
@@ -157,7 +157,7 @@ class Belief:
             raise ValueError("inflow must be 'white' for true states, got 'learned': the cached "
                              "episode does not include the inflow")
         world = self.rules.world
-        level = self._filters.c_ref[0]
+        level = self.filters.c_ref[0]
         mass = scoring_constants(world).mass
         whole = 0.5 * (mass.sum(axis=0) + mass.sum(axis=1))  # ∫ of each basis function
         beyond = (world.background - level) * whole + entries["moment"]
@@ -177,12 +177,12 @@ class Belief:
     @property
     def _state(self) -> np.ndarray:
         """(s,) present mean in double precision."""
-        return self._filters.filter.mean[0].astype(float)
+        return self.filters.filter.mean[0].astype(float)
 
     @property
     def mean(self) -> np.ndarray:
         """(n,) estimate in mol/m³ at the nodes of the task's mesh."""
-        return self._filters.means()[0]
+        return self.filters.means()[0]
 
     @property
     def healthy_electrodes(self) -> np.ndarray:
@@ -204,7 +204,7 @@ class Belief:
         """
         transition, noise, _ = self._step(steps_ahead)
         if covariance is None:
-            covariance = self._filters.filter.covariance[0].astype(float)
+            covariance = self.filters.filter.covariance[0].astype(float)
         return transition @ covariance @ transition.T + noise
 
     def _step(self, steps_ahead: int) -> tuple[np.ndarray, ...]:
@@ -258,8 +258,8 @@ class Belief:
         criteria = pair_design_criteria(DP @ D.T, DP @ weight @ DP.T,
                                         number[self.rules.pairs.T], variance)
         usable = np.ones(len(self.rules.pairs))
-        if self._filters.faults is not None:
-            usable = self._filters.faults.flow_probability(self._driven)
+        if self.filters.faults is not None:
+            usable = self.filters.faults.flow_probability(self._driven)
         if healthy is not None:
             usable = usable * healthy[self.rules.pairs].all(axis=1)
         return criteria[0] * usable, criteria[1] * usable
@@ -316,7 +316,7 @@ class Belief:
         the prediction."""
         state = self._step(0)[2]
         coordinates = self._shared.states.coordinates(state[None])[0]
-        about = self._shared.linearisation(self._filters.indices[0], coordinates)
+        about = self._shared.linearisation(self.filters.indices[0], coordinates)
         return about._replace(jacobian=self._by_state(state, about.jacobian))
 
     @property
@@ -326,9 +326,9 @@ class Belief:
 
     def relinearised_jacobian(self) -> np.ndarray:
         """Return the derivatives (L, L, s) of 𝓡 about the present estimate, in about 10 ms."""
-        level = self._filters.c_ref[0]
+        level = self.filters.c_ref[0]
         positive = np.maximum(self.mean, 0.1 * level)
-        _, table = self._filters.table.task.observation.resistance_derivatives(positive)
+        _, table = self.filters.table.task.observation.resistance_derivatives(positive)
         by_coordinates = level * np.tensordot(table, self._shared.states.basis, axes=(0, 0))
         return self._by_state(self._state, by_coordinates)
 
@@ -353,11 +353,11 @@ class Belief:
         i, j = self.rules.pairs.T
         R = self.linearisation.resistance
         voltages = self.rules.amplitude * (R[i] - R[j])
-        std = self._filters.table.noise_std(voltages, self.rules.instrument.noise_floor)
+        std = self.filters.table.noise_std(voltages, self.rules.instrument.noise_floor)
         variance = np.square(std / self.rules.amplitude)
-        if self._filters.faults is None:
+        if self.filters.faults is None:
             return variance
-        return variance / np.maximum(self._filters.faults.weights(self._driven), REJECTED_WEIGHT)
+        return variance / np.maximum(self.filters.faults.weights(self._driven), REJECTED_WEIGHT)
 
     @property
     def _driven(self) -> np.ndarray:

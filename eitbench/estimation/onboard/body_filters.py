@@ -97,12 +97,12 @@ class BodyBelief:
 
     def __init__(self, rules: Rules, start: dict[str, np.ndarray] | BodyFilters) -> None:
         self.rules = rules
-        self._filters = (start if isinstance(start, BodyFilters)
-                         else BodyFilters(rules, start["frame"][None]))
-        model = self._filters.filter.model
+        self.filters = (start if isinstance(start, BodyFilters)
+                        else BodyFilters(rules, start["frame"][None]))
+        model = self.filters.filter.model
         entries, number = symmetric_entries(len(model.resistance))
         signals = rules.amplitude * model.signals[entries]
-        self._functionals = np.vstack([signals, self._filters.patches.toarray()]).T.copy()
+        self._functionals = np.vstack([signals, self.filters.patches.toarray()]).T.copy()
         """(G, N + patches) entries of 𝓡 and patches, of a body at each grid point"""
         currents = rules.action_currents[:len(rules.pairs)]
         mask = (np.ones(currents.shape, dtype=bool) if rules.chooses_readings
@@ -117,7 +117,7 @@ class BodyBelief:
 
     def update(self, observation: dict[str, np.ndarray]) -> None:
         """Assimilate the outcome of the last injection."""
-        self._filters.assimilate(observation["voltages"][None], observation["currents"][None])
+        self.filters.assimilate(observation["voltages"][None], observation["currents"][None])
 
     def criteria(self, episode: int = 0) -> tuple[np.ndarray, np.ndarray]:
         """Return the A- and D-criterion of each pair, (pairs,) each, of the next injection.
@@ -128,7 +128,7 @@ class BodyBelief:
         pair.
         """
         i, j = self._entries
-        filters = self._filters.filter
+        filters = self.filters.filter
         here = slice(episode, episode + 1)
         # the random numbers of the filter's next step are not known
         particles, (weights,) = filters.model.move(
@@ -145,7 +145,7 @@ class BodyBelief:
         variance = np.diagonal(covariance)
         square = variance[i] + variance[j] - 2.0 * covariance[i, j] + (mean[i] - mean[j])**2
         noise = self._variance + filters.model.motion.signal_error**2 * square
-        cross = covariance[:, -self._filters.patches.shape[0]:]
+        cross = covariance[:, -self.filters.patches.shape[0]:]
         tables = covariance, cross @ cross.T
         if not self.rules.chooses_readings:
             return pair_design_criteria(*tables, self._entries, noise)
