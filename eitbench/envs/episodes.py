@@ -21,7 +21,12 @@ from gymnasium.vector.utils import batch_space
 
 from eitbench import _check
 from eitbench._extras import require_extra
-from eitbench.data.episode_cache import cached_episode, cached_episode_prefix, concentration_at
+from eitbench.data.episode_cache import (
+    cached_episode,
+    cached_episode_prefix,
+    concentration_at,
+    integrals,
+)
 from eitbench.data.presimulation import EpisodeSampler
 from eitbench.data.seeds import warn_test_seeds
 from eitbench.worlds.task import Task, make_task
@@ -83,7 +88,11 @@ class EpisodeCore(ABC):
     def _load(self, recordings: Sequence[np.ndarray]) -> None:
         self._known = min(map(len, recordings))
         """steps that are loaded"""
-        self._read(recordings)
+        counted = [integrals(self.world, entries) for entries in recordings]
+        self._deviations, self._squares = (
+            np.stack([getattr(each, name)[:self._known] for each in counted], axis=1)
+            for name in ("deviation", "square"))
+        self._read(recordings, [each.moment for each in counted])
 
     def load_until(self, t: int) -> None:
         """Load at least the steps 1 … t of each episode."""
@@ -94,8 +103,9 @@ class EpisodeCore(ABC):
             self._load([cached_episode(self.world, seed) for seed in self.seeds])
 
     @abstractmethod
-    def _read(self, recordings: Sequence[np.ndarray]) -> None:
-        """Copy the arrays of cached episodes, which are mapped from files that stay open."""
+    def _read(self, recordings: Sequence[np.ndarray], moments: Sequence[np.ndarray]) -> None:
+        """Copy other arrays of cached episodes, which are mapped from files that stay open, with
+        moments (known steps or more, n)."""
 
     @abstractmethod
     def check(self, action: Any, space: Any) -> np.ndarray:

@@ -11,7 +11,6 @@ from gymnasium import spaces
 from eitbench import _check
 from eitbench.data.episode_cache import (
     cycle_voltages,
-    integrals,
     score_mass,
     scoring_constants,
     step_error,
@@ -76,23 +75,17 @@ class EstimationCore(EpisodeCore):
         self.estimate_std = None
         super().reset(seeds, provide)
 
-    def _read(self, recordings: Sequence[np.ndarray]) -> None:
+    def _read(self, recordings: Sequence[np.ndarray], moments: Sequence[np.ndarray]) -> None:
         world = self.world
         self.voltages = np.zeros((self.length + 1, len(recordings), self.currents.shape[1]))
         """(T + lag + 1, B, L) V of the steps that are loaded, else 0"""
         k = slice(self._known)
-        self._deviations, self._squares = np.empty((2, self._known, len(recordings)))
-        self._moments: list[np.ndarray] = []
-        self._flows: list[tuple[np.ndarray, np.ndarray]] = []
         for b, (seed, entries) in enumerate(zip(self.seeds, recordings, strict=True)):
-            counted = integrals(world, entries)
             self.voltages[k, b] = cycle_voltages(world, seed, entries[k])
-            self._deviations[:, b] = counted.deviation[k]
-            self._squares[:, b] = counted.square[k]
-            self._moments.append(counted.moment[world.warm_up:].copy())
-            if world.velocity_model is not None:
-                self._flows.append((entries["velocity_moment"].copy(),
-                                    entries["velocity_square"].copy()))
+        self._moments = [moment[world.warm_up:].copy() for moment in moments]
+        if world.velocity_model is not None:
+            self._flows = [(entries["velocity_moment"].copy(), entries["velocity_square"].copy())
+                           for entries in recordings]
 
     def check(self, action: Any, space: Any) -> np.ndarray:
         return check_actions(action, space, self.n_nodes)

@@ -9,7 +9,7 @@ import numpy as np
 from gymnasium import spaces
 
 from eitbench import _check
-from eitbench.data.episode_cache import instrument_faults, integrals, score_mass, scoring_constants
+from eitbench.data.episode_cache import instrument_faults, score_mass, scoring_constants
 from eitbench.envs.episodes import EpisodeCore, Observation
 from eitbench.estimation.onboard.episode_filters import BODY
 from eitbench.estimation.onboard.full_filters import filters_class
@@ -132,14 +132,10 @@ class InjectionCore(EpisodeCore):
         world = self.world
         B = len(seeds)
         L = world.currents.shape[1]
-        T = world.n_steps
         self.t = self.n_initial
         """injections so far, including the first frame"""
         self.n_injections = np.zeros(B, dtype=int)
         """(B,) used injections of the budget; 0 without a budget"""
-        self._resistance = np.empty((T, B, L, L))
-        self._draws = np.empty((T, B, L))
-        self._deviations, self._squares, self._totals = np.empty((3, B, T))
         self._voltages, self.currents = np.zeros((2, B, L))
         """V and A (A/m in 2D), (B, L) each, of the last injections"""
         self._recent = np.zeros((B, N_RECENT_CURRENTS, L))
@@ -160,29 +156,25 @@ class InjectionCore(EpisodeCore):
         self._recent[:] = world.currents[(-1 - np.arange(N_RECENT_CURRENTS)) % self.n_initial]
         self._area = score_mass(world).sum()
 
-    def _read(self, recordings: Sequence[np.ndarray]) -> None:
-        moments = []
+    def _read(self, recordings: Sequence[np.ndarray], moments: Sequence[np.ndarray]) -> None:
         k = slice(self._known)
-        for b, entries in enumerate(recordings):
-            counted = integrals(self.world, entries)
-            self._resistance[k, b] = entries["transfer_resistance"][k]
-            self._draws[k, b] = entries["noise"][k]
-            self._deviations[b, k] = counted.deviation[k]
-            self._squares[b, k] = counted.square[k]
-            self._totals[b, k] = counted.moment[k].sum(axis=1, dtype=float)
-            if self._filters_type:
-                # all rows, so that rounding of the matrix product does not depend on their number
-                moment = np.zeros((self.world.n_steps, counted.moment.shape[1]), np.float32)
-                moment[k] = counted.moment[k]
-                moments.append(self._filters_type.project(self.rules, moment))
-        self._moments = np.array(moments)
+        self._resistance, self._draws = (
+            np.stack([entries[name][k] for entries in recordings], axis=1)
+            for name in ("transfer_resistance", "noise"))
+        self._totals = np.stack([moment[k].sum(axis=1, dtype=float) for moment in moments], axis=1)
+        if self._filters_type:
+            # all rows, so that rounding of the matrix product does not depend on their number
+            rest = (0, self.world.n_steps - self._known), (0, 0)
+            self._moments = np.array([
+                self._filters_type.project(self.rules, np.pad(moment[k], rest))
+                for moment in moments])
 
     def homogeneous_errors(self) -> np.ndarray:
         """Return the relative errors (B,) of the homogeneous estimates of the present state."""
         k = self.t - 1
         level = self.filters.c_ref - self.world.background
-        error = self._area * level**2 - 2.0 * level * self._totals[:, k] + self._deviations[:, k]
-        return np.asarray(error / self._squares[:, k])
+        error = self._area * level**2 - 2.0 * level * self._totals[k] + self._deviations[k]
+        return np.asarray(error / self._squares[k])
 
     def _measure(self, k: int, currents: np.ndarray,
                  electrodes: np.ndarray | None = None) -> np.ndarray:
@@ -241,8 +233,8 @@ class InjectionCore(EpisodeCore):
             return np.full(len(self.n_injections), np.nan)
         if self._errors is None:
             k = self.t - 1
-            self._errors = self.filters.errors(self._moments[:, k], self._deviations[:, k],
-                                                self._squares[:, k])
+            self._errors = self.filters.errors(self._moments[:, k], self._deviations[k],
+                                               self._squares[k])
         return self._errors
 
     def trial_errors(self, actions: np.ndarray) -> np.ndarray:
@@ -256,7 +248,7 @@ class InjectionCore(EpisodeCore):
         trial.assimilate(self.rules.instrument.measure(
             self.faults, k + 1, self._resistance[k], currents, np.zeros_like(currents),
             self.rules.electrodes(actions)), currents)
-        return trial.errors(self._moments[:, k], self._deviations[:, k], self._squares[:, k])
+        return trial.errors(self._moments[:, k], self._deviations[k], self._squares[k])
 
     def estimate(self) -> tuple[np.ndarray, np.ndarray]:
         """Return present means and standard deviations (B, n) in mol/m³; without an estimator the

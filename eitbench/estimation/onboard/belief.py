@@ -244,10 +244,10 @@ class Belief:
 
         Electrodes that are not ``healthy`` contribute no measurement, and pairs with one of them
         score 0. Estimated faults increase the noise, and the criteria are multiplied by the
-        probability that the current flows. By default ``jacobian`` is `jacobian`, and ``weight`` is
-        for present errors in the scored region.
+        probability that the current flows. By default ``jacobian`` belongs to `linearisation`, and
+        ``weight`` is for present errors in the scored region.
         """
-        jacobian = self.jacobian if jacobian is None else jacobian
+        jacobian = self.linearisation.jacobian if jacobian is None else jacobian
         entries, number = symmetric_entries(len(jacobian))
         D = jacobian.reshape(len(jacobian)**2, -1)[entries]
         DP = D @ covariance
@@ -275,7 +275,8 @@ class Belief:
         """Return the covariance (s, s) after an injection through this pair."""
         i, j = self.rules.pairs[pair]
         variance = self._noise_variance[pair]
-        matrix = (self.jacobian[i] - self.jacobian[j]) / np.sqrt(variance)[:, None]
+        jacobian = self.linearisation.jacobian
+        matrix = (jacobian[i] - jacobian[j]) / np.sqrt(variance)[:, None]
         if healthy is not None:
             if not healthy[[i, j]].all():
                 return covariance
@@ -312,17 +313,12 @@ class Belief:
 
     @cached_property
     def linearisation(self) -> Linearisation:
-        """Linearisation of 𝓡 for the next measurement: about c_ref, or with a learned inflow about
-        the prediction."""
+        """Linearisation of 𝓡 for the next measurement, with derivatives (L, L, s): about c_ref, or
+        with a learned inflow about the prediction."""
         state = self._step(0)[2]
         coordinates = self._shared.states.coordinates(state[None])[0]
         about = self._shared.linearisation(self.filters.indices[0], coordinates)
         return about._replace(jacobian=self._by_state(state, about.jacobian))
-
-    @property
-    def jacobian(self) -> np.ndarray:
-        """(L, L, s) derivatives of `linearisation`."""
-        return self.linearisation.jacobian
 
     def relinearised_jacobian(self) -> np.ndarray:
         """Return the derivatives (L, L, s) of 𝓡 about the present estimate, in about 10 ms."""

@@ -174,4 +174,6 @@ class SharedData:
         return _shared(rules.world.fault_free, rules.inflow)
 
 
-_shared = lru_cache(maxsize=4)(SharedData)
+@lru_cache(maxsize=4)
+def _shared(world: World, inflow: str) -> SharedData:
+    return SharedData(world, inflow)
