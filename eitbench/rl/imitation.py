@@ -100,11 +100,10 @@ def rollout(world: InjectionEnv, method: Method, episode: int, random: np.random
     observation, _ = world.reset(seed=episode)
     policy = method.make(world.rules, random, *[world.core] * method.privileged)
     seen, actions, rewards = [], [], []
-    ended = False
-    while not ended:
+    for _ in range(world.episode_steps):
         actions.append(policy.act(observation))
         seen.append(flatten_scaled(world.rules, observation))
-        observation, reward, ended, _, _ = world.step(actions[-1] if act is None else act(seen[-1]))
+        observation, reward, *_ = world.step(actions[-1] if act is None else act(seen[-1]))
         rewards.append(reward)
     return np.array(seen), np.array(actions), np.array(rewards)
 

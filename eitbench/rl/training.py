@@ -251,19 +251,16 @@ def make_evaluator(env: str, kwargs: dict[str, Any] | None,
         returns = np.zeros(len(seeds))
         state = None
         errors: list[np.ndarray] = []           # of scored states; some may be failed estimates
-        length = 0
-        ended = False
-        while not ended:
+        length = envs.cores[0].length
+        for k in range(length):
             how: Any = {"action_masks": envs.action_masks()} if isinstance(model, MaskablePPO) \
                 else {}
-            actions, state = model.predict(observation, state, np.full(len(seeds), length == 0),
+            actions, state = model.predict(observation, state, np.full(len(seeds), k == 0),
                                            deterministic=True, **how)
-            observation, rewards, done, _, info = envs.step(actions)
+            observation, rewards, _, _, info = envs.step(actions)
             returns += rewards
-            length += 1
             if "error" in info:
                 errors.append(info["error"])
-            ended = bool(done.all())
         return np.mean(errors, axis=0), returns, np.full(len(seeds), length)
 
     return evaluate
