@@ -67,19 +67,21 @@ FLOAT64_ARRAYS = ("velocities",)
 """Arrays that are stored in double precision."""
 
 
-def reduced_states(world: World, inflow: str) -> tuple[ReducedStates, ReducedStates]:
-    """Return the reduced state space of a world in double and in single precision."""
+def reduced_states(world: World, inflow: str,
+                   ) -> tuple[ReducedStates, ReducedStates, NodeVoltages | None]:
+    """Return the reduced state space of a world in double and in single precision, and with a
+    learned inflow the voltages in its basis."""
     if inflow == "learned":
-        learned, _ = load_or_build_learned(world)
-        return InflowStates(learned), InflowStates(single_precision(learned))
+        learned, voltages = load_or_build_learned(world)
+        return InflowStates(learned), InflowStates(single_precision(learned)), voltages
     model = load_or_build_model(world)
     if isinstance(model, ReducedModel):
-        return SteadyStates(model), SteadyStates(single_precision(model))
+        return SteadyStates(model), SteadyStates(single_precision(model)), None
     flow = make_task(world).velocity
     assert flow is not None
     bounds = (VELOCITY_BOUNDS[0] * flow.nominal[0], VELOCITY_BOUNDS[1] * flow.nominal[0])
     how = flow.nominal[0], flow.initial_std[0], flow.walk_std[0], bounds
-    return JointStates(model, *how), JointStates(single_precision(model), *how)
+    return JointStates(model, *how), JointStates(single_precision(model), *how), None
 
 
 def single_precision(model: Any) -> Any:

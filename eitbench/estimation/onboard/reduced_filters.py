@@ -14,11 +14,7 @@ from eitbench.estimation.onboard.linearisation import (
     linearisation_table,
     std_from_variance,
 )
-from eitbench.estimation.onboard.models import (
-    load_or_build_learned,
-    reduced_states,
-    single_precision,
-)
+from eitbench.estimation.onboard.models import reduced_states, single_precision
 from eitbench.estimation.onboard.rules import Rules
 from eitbench.estimation.reduced import ReducedFilter, matvec
 from eitbench.worlds.world import World
@@ -114,10 +110,8 @@ class SharedData:
     def __init__(self, world: World, inflow: str) -> None:
         self._made_of = world, inflow
         self.levels = linearisation_table(world)
-        self.states, self.single = reduced_states(world, inflow)
-        voltages = load_or_build_learned(world)[1] if inflow == "learned" else None
-        self._voltages = voltages
-        self._single_voltages = None if voltages is None else single_precision(voltages)
+        self.states, self.single, self._voltages = reduced_states(world, inflow)
+        self._single_voltages = self._voltages and single_precision(self._voltages)
         self._level = cache(self._projected)
         basis = self.states.basis
         with_level = np.column_stack([np.ones(len(basis)), basis])
