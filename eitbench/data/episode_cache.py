@@ -301,7 +301,7 @@ def score_operators(world: World) -> tuple[sp.csr_array, sp.csr_array]:
     return _score_operators(world.vessel, world.region)
 
 
-@lru_cache(maxsize=4)
+@lru_cache(maxsize=8)
 def _score_operators(vessel: Any, region: tuple[float, float] | None,
                      ) -> tuple[sp.csr_array, sp.csr_array]:
     from eitbench.numerics.fem import mass_matrix
