@@ -101,11 +101,11 @@ def draw_isosurfaces(axes: Axes, mesh: Mesh, values: np.ndarray, low: float, hig
     surfaces = [isosurface(mesh, values, level) for level in (low, high)]
     colours = np.repeat([LOW_COLOUR, HIGH_COLOUR], list(map(len, surfaces)))
     if len(colours):
-        _draw(axes, np.concatenate(surfaces), colours)
+        _draw_triangles(axes, np.concatenate(surfaces), colours)
     _outline(axes, mesh)
 
 
-def _draw(axes: Axes, triangles: np.ndarray, colours: np.ndarray) -> None:
+def _draw_triangles(axes: Axes, triangles: np.ndarray, colours: np.ndarray) -> None:
     """Draw triangles (k, 3, 3) in m projected by `_EYE`, the furthest first, with shading."""
     seen = 100.0 * triangles @ _EYE.T
     normal = np.cross(seen[:, 1] - seen[:, 0], seen[:, 2] - seen[:, 0])

@@ -17,7 +17,6 @@ class InjectionVecEnv(VecEnv):
 
     Parameters
     ----------
-    envs : InjectionVectorEnv
     reward_scale : float
         Factor of the rewards, which are of the order of 0.01.
     reference : (episodes, steps), optional
