@@ -11,7 +11,6 @@ import math
 import os
 import platform
 import re
-import sys
 import time
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
@@ -25,8 +24,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from threadpoolctl import threadpool_info
-
-sys.path.append(str(Path(__file__).parents[1] / "tests"))      # `references` is there
 
 Work = Callable[[], object]
 

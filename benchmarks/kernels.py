@@ -1,6 +1,6 @@
 """Speed of the compiled kernels relative to scipy: `python benchmarks/run.py kernels`.
 
-The scipy implementation is the reference of the tests, `tests/references.py`.
+The scipy implementation is in `references.py`.
 """
 
 from __future__ import annotations
@@ -18,7 +18,8 @@ from eitbench.physics.transport import ConvectionDiffusion
 from eitbench.worlds.catalogue import PIPE_2D
 
 CELLS = {"the estimators' model": (5, 14), "the truth": (10, 28)}
-FLOWS = {"the estimators' model": (PIPE_2D.model, 1), "the truth": (PIPE_2D.truth, 8)}
+FLOWS = {"the estimators' model": (PIPE_2D.estimator_model, 1),
+         "the truth": (PIPE_2D.truth_model, 8)}
 VELOCITY = PlaneChannelFlow(PIPE_2D.flow.mean_velocity, PIPE_2D.vessel.half_width)
 
 

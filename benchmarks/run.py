@@ -37,7 +37,7 @@ machine a ratio may vary by a third between runs. Targets were set before measur
 - *ratio*: time of eitbench divided by the reference, or the inverse for "faster"
 - *limited by*: resource that dominates the time of eitbench
 - *ceiling*: attained fraction of the machine's peak performance, measured in the same process
-- *eitbench with scipy's SuperLU and sparse products*: the reference in `tests/references.py`
+- *eitbench with scipy's SuperLU and sparse products*: the reference in `references.py`
 
 ```sh
 python3 -m venv peers

@@ -57,12 +57,19 @@ def run_cache(pytestconfig, tmp_path_factory):
     kept = getattr(pytestconfig, "cache", None)
     if not kept:
         return str(tmp_path_factory.mktemp("episodes"))
-    import eitbench  # after the number of BLAS threads is set
     code = hashlib.sha256()
-    for names in ("numerics/*", "physics/*", "worlds/*", "data/*", "estimation/covariance"):
-        for file in sorted(Path(eitbench.__file__).parent.glob(f"{names}.py")):
+    for names in (*(f"eitbench/{part}" for part in (
+            "numerics/*", "physics/*", "worlds/*", "data/*", "estimation/covariance")), "examples/*/*/world"):
+        for file in sorted(TESTS.parent.glob(f"{names}.py")):
             code.update(file.read_bytes())
     return str(kept.mkdir(f"episodes-{code.hexdigest()[:16]}"))
+
+
+@pytest.fixture(scope="session")
+def published():
+    """Return the records in the repository, which take seconds to read."""
+    from eitbench.bench.records import read_records  # after the number of BLAS threads is set
+    return read_records(TESTS.parent / "leaderboards" / "results")
 
 
 @pytest.fixture(scope="session", autouse=True)

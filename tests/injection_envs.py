@@ -48,7 +48,6 @@ def some_pairs(steps: int = 120, envs: int = 1, seed: int = 0) -> np.ndarray:
 
 
 def some_actions(env: gym.Env, steps: int = 120) -> np.ndarray:
-    """Return actions of the environment's kind."""
     if isinstance(env.action_space, gym.spaces.MultiDiscrete):
         return np.random.default_rng(0).integers(env.action_space.nvec, size=(steps, *env.action_space.shape))
     if env.action_space.shape:

@@ -8,10 +8,3 @@ def forget():
     cache._sound.clear()
     episode_cache.scoring_constants.__wrapped__.cache_clear()
     episode_cache._prefix.cache_clear()
-
-
-def forget_made(module):
-    """Clear all caches of a module's functions."""
-    for value in vars(module).values():
-        if hasattr(value, "cache_clear"):
-            value.cache_clear()

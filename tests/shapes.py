@@ -240,6 +240,34 @@ def write_mesh(path, mesh: Mesh, groups: dict | None = None) -> None:
     ).write(path, file_format="gmsh22", binary=False)
 
 
+# -- fields on triangles, without the package's finite elements --------------------------------------------------------
+
+
+def values_at(points, mesh):
+    """Return the dense matrix from nodal values on ``mesh`` to ``points``, with a search of all cells."""
+    matrix, found = np.zeros((len(points), mesh.n_nodes)), np.zeros(len(points), dtype=bool)
+    homogeneous = np.column_stack([points, np.ones(len(points))])
+    for cell in mesh.cells:
+        weights = homogeneous @ np.linalg.inv(np.column_stack([mesh.points[cell], np.ones(3)]))
+        inside = (weights > -1e-9).all(axis=1) & ~found
+        matrix[np.ix_(inside, cell)] = weights[inside]
+        found |= inside
+    assert found.all()
+    return matrix
+
+
+def integral_of_square(mesh, nodal, region=(-np.inf, np.inf)):
+    """∫f² for nodal values (..., n) over the triangles within a range of x: the three midpoints of a triangle's edges
+    integrate a quadratic exactly."""
+    x = mesh.points[mesh.cells][..., 0]
+    cells = mesh.cells[(x.min(axis=1) > region[0] - 1e-9) & (x.max(axis=1) < region[1] + 1e-9)]
+    corner = nodal[..., cells]
+    middles = 0.5 * (corner + np.roll(corner, 1, axis=-1))
+    edges = mesh.points[cells[:, 1:]] - mesh.points[cells[:, :1]]
+    area = 0.5 * np.abs(edges[:, 0, 0] * edges[:, 1, 1] - edges[:, 0, 1] * edges[:, 1, 0])
+    return (middles**2).mean(axis=-1) @ area
+
+
 def uniform(*velocity):
     """Return a field with this value everywhere."""
     return lambda points: np.broadcast_to(np.array(velocity, dtype=float), points.shape)

@@ -2,10 +2,13 @@
 
 from dataclasses import replace
 
+from eitbench.data.episodes import cached_truth_model
 from eitbench.worlds import entries, entry, registry
 from eitbench.worlds.bodies import MovingBody
+from eitbench.worlds.catalogue import PIPE_2D
+from eitbench.worlds.random_streams import episode_streams
 
-PLAIN = [name for name, each in entries().items() if each.world == entry("eitbench/Pipe2D-v0").world]
+PLAIN = [name for name, each in entries().items() if each.world == PIPE_2D]
 """Ids with the thesis' pipe as it is."""
 
 
@@ -22,6 +25,7 @@ def merged(*changes: dict) -> dict:
 FAST = {"flow": {"mean_velocity": 45.0}, "schedule": {"scored_steps": 3, "pattern": {"frame": 2}},
         "vessel": {"electrodes_per_wall": 2}}
 """A fast fluid flushes the pipe in two steps: five measurements, the last three states are scored."""
+TINY = PIPE_2D.with_changes(FAST)
 DRAWN = merged(FAST, {"flow": {"velocity_range": [40.0, 50.0]}})
 WANDERING = merged(DRAWN, {"region": [0.28, 0.40], "schedule": {"scored_steps": 5}})
 TANK = {"vessel": {"n_electrodes": 8}, "schedule": {"warm_up": 1, "scored_steps": 4}}
@@ -68,6 +72,12 @@ def world(name: str) -> dict:
         kind = "TankInjection" if kind == "RotatingTank2D" else "PipeInjection"
     assert kind in SHORT, f"{name} has no short version yet: give {kind!r} one in tests/short.py"
     return {"world": SHORT[kind]}
+
+
+def truths(world, *seeds):
+    """Simulate the concentrations and velocities of episodes together, without voltages."""
+    streams = [episode_streams(seed) for seed in seeds]
+    return list(world.target.evolve(world, streams, cached_truth_model(world), lambda _: None, world.n_steps))
 
 
 def short(name: str) -> dict:

@@ -53,7 +53,6 @@ def test_table_is_current(page):
 
 
 def test_readme_is_short():
-    """README has less than 130 lines."""
     assert len((ROOT / "README.md").read_text(encoding="utf-8").splitlines()) < 130
 
 

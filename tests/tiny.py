@@ -1,12 +1,17 @@
-"""A world with fast episodes, and user-defined methods."""
+"""A world with fast episodes, user-defined methods, and records with the tables of their leaderboards."""
 
 import hashlib
 import json
 from pathlib import Path
 
+import pandas as pd
+import pytest
 from eitbench.bench import store
+from eitbench.bench.isolation import bubblewrap_problem
 from eitbench.bench.records import SCHEMA, split_of, with_content_hash
+from eitbench.bench.table import Table
 from eitbench.bench.tracks import Environment
+from eitbench.report.boards import leaderboard_table, leaderboards
 
 from short import FAST
 
@@ -14,6 +19,8 @@ FILTER = Environment("eitbench/Pipe2D-v0", json.dumps({"world": FAST}))
 FIXED_LAG = Environment("eitbench/Pipe2DFixedLag-v0", json.dumps({"world": FAST, "lag": 2}))
 SMOOTHING = Environment("eitbench/Pipe2DSmoothing-v0", json.dumps({"world": FAST}))
 
+ISOLATION = "process" if bubblewrap_problem() else "bubblewrap"
+confined = pytest.mark.skipif(bool(bubblewrap_problem()), reason=bubblewrap_problem() or "bubblewrap works")
 RUN = {"command": "eitbench run", "blas": "scipy-openblas", "commit": "c0ffee", "dirty": False,
        "source": hashlib.sha256(b"code").hexdigest(),
        "versions": {"python": "3.12.1", "eitbench": "0.1.0", "numpy": "2.4.6", "scipy": "1.17.1",
@@ -90,7 +97,6 @@ def counting(log: Path) -> str:
 
 
 def count(log: Path) -> int:
-    """Return the number of lines in ``log``."""
     return len(log.read_text().splitlines()) if log.exists() else 0
 
 
@@ -103,7 +109,6 @@ def strict(text: str):
 
 
 def sha(text: str) -> str:
-    """Return a well-formed hash."""
     return hashlib.sha256(text.encode()).hexdigest()
 
 
@@ -134,6 +139,16 @@ def record(method: str, errors: dict[str, float | None] | list[float | None], *,
         "version": version if version.startswith("v") else sha(method + version)[:8],
         "split": split_of(next(iter(errors))), "seeds": list(errors), "runs": [RUN],
         "episodes": episodes} | changes)
+
+
+def said(table: Table) -> pd.DataFrame:
+    """Return all cells as plain text under their headings."""
+    return pd.DataFrame([[cell.plain_text for cell in row.cells] for row in table.rows], columns=table.headings)
+
+
+def boards(records: list[dict]) -> pd.DataFrame:
+    """Return the rows of all leaderboards."""
+    return leaderboard_table(leaderboards(records))
 
 
 def several_boards() -> list[dict]:

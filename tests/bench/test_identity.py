@@ -13,9 +13,8 @@ from eitbench.bench.tracks import Environment
 from eitbench.data.cache import CACHE_VARIABLE
 from eitbench.worlds import entry, register, registry
 
-from short import FAST, register_apart
+from short import FAST, TINY, register_apart
 from tiny import FILTER, FIXED_LAG, count, counting, write_baseline
-from tiny_worlds import TINY
 
 ID = "mine/Tiny-v0"
 SCRIPT = '''
@@ -46,7 +45,6 @@ for _ in range(2):
 
 @pytest.fixture(autouse=True)
 def apart(run_cache, monkeypatch):
-    """Remove registrations of a test after it."""
     monkeypatch.setenv(CACHE_VARIABLE, run_cache)
     register_apart(monkeypatch)
 

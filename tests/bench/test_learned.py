@@ -145,7 +145,6 @@ def test_lagged_modes_are_of_the_same_state(study, short, monkeypatch):
     ("eitbench/Pipe2D-v0", {}, {}, {"learned_voltages"}, {"learned_obstacle"}),
     ("eitbench/StationaryTank2D-v0", {}, {}, set(), set(LEARNED))])
 def test_networks_are_compatible_with_their_training_task(id, changes, arguments, suitable, unsuitable):
-    """Networks match a lag, a vessel and a flow model."""
     task = make_task(entry(id).world.with_changes(changes), **dict(entry(id).settings) | arguments)
     found = {name for name in suitable | unsuitable if load_method(name, "estimation").suits(task)}
     assert found == suitable

@@ -47,7 +47,6 @@ def test_replaying_gives_the_same_again():
 
 
 def test_the_policy_has_the_same_random_stream_as_in_runs():
-    """The random stream is the same: injections equal those in `eitbench run`."""
     export_minari(NAME, ENV, "random_pair", "dev:3")
     (episode,) = minari.load_dataset(NAME).iterate_episodes()
     env = gym.make(ENV, observation="raw").unwrapped

@@ -1,21 +1,25 @@
-"""Injection policies: belief, rollouts and error messages."""
+"""Injection policies: belief, rollouts, scores of the filter inside the environment, and error messages."""
 
 import json
 from types import SimpleNamespace
 
+import eitbench
 import numpy as np
 import pandas as pd
 import pytest
+from eitbench import scoring
 from eitbench.bench import runner
 from eitbench.bench.methods import builtin_methods, load_method
 from eitbench.bench.run import Job, run_jobs
+from eitbench.bench.scores import Outcome, compute_scores
 from eitbench.bench.store import EpisodeStore
 from eitbench.bench.tracks import Environment
-from eitbench.data.episode_cache import truth_mesh
+from eitbench.data.episode_cache import mass_between, truth_mesh
 from eitbench.data.seeds import parse_seeds
 from eitbench.envs.injection import InjectionEnv
 from eitbench.estimation.onboard.belief import Belief
 from eitbench.estimation.onboard.rules import Rules
+from eitbench.numerics.fem import mass_matrix
 from eitbench.report.policies import (
     adaptive_ratio,
     adaptivity_gap,
@@ -28,7 +32,7 @@ from eitbench.worlds import entry
 from eitbench.worlds.catalogue import PIPE_2D
 from scipy.stats import t as student
 
-from injection_envs import BUDGET, CURRENTS, FAULTS, FLOW, INFLOW, NAME, TANK, filter_of, injected
+from injection_envs import BUDGET, CURRENTS, FAULTS, FLOW, INFLOW, NAME, TANK, filter_of, injected, make
 from short import merged, world
 from tiny import write_policy
 
@@ -49,17 +53,13 @@ def test_belief_is_the_filter_inside(name):
     observation, _ = env.reset(seed=SEED)
     belief = Belief(env.rules, observation)
     for pair in (7, 100, None if env.rules.budget else 3, 7):
-        predicted = belief.predict_covariance()
+        belief.predict_covariance()                                      # changes nothing
         observation, *_ = env.step(env.rules.action(pair))
         belief.update(observation)
         inside = filter_of(env)
         np.testing.assert_array_equal(belief.mean, inside.means()[0])
         expected = inside.filter.covariance[0].astype(float)
         np.testing.assert_array_equal(filter_of(belief).filter.covariance[0], expected)
-        if name == NAME:                         # the predicted covariance: no measurement was rejected
-            np.testing.assert_allclose(belief.posterior_covariance(predicted, pair), expected,
-                                       atol=2e-5 * np.abs(expected).max())
-            assert belief.design_criteria(predicted)[0][pair] == pytest.approx((predicted - expected).trace(), rel=1e-3)
 
 
 def test_faulty_electrodes_have_no_design_criterion():
@@ -313,3 +313,67 @@ def test_the_interval_of_the_adaptivity_gap_is_student_s():
     slopes = ((best - seer) - gap * (lot - seer)) / span
     half = student.ppf(0.975, 11) * slopes.std(ddof=1) / np.sqrt(12)
     assert (high - low) / 2 == pytest.approx(half, rel=0.04)
+
+
+def seen_in_a_separate_environment(name: str, currents: np.ndarray) -> dict[str, list]:
+    """Return the outputs of a separate environment at each scored step, for the same injections."""
+    env = make("reduced", name).unwrapped
+    env.reset(seed=SEED)
+    pairs = env.rules.pairs.tolist()
+    truth = eitbench.simulate(env.world, SEED).concentration.astype(float)
+    seen: dict[str, list] = {key: [] for key in ("error", "mean", "std", "truth", "nis")}
+    for k, each in enumerate(currents):
+        pair = pairs.index([int(each.argmax()), int(each.argmin())]) if each.any() else None
+        env.step(env.rules.action(pair))
+        if env.error is None:
+            continue
+        mean, std = (part[0] for part in env.core.estimate())
+        for key, value in (("error", env.error), ("mean", mean), ("std", std),
+                           ("truth", truth[len(env.world.currents) + k + 1])):
+            seen[key].append(value)
+        if (innovation := env.core.filters.innovations()[0]) is not None:
+            value, covariance = innovation
+            seen["nis"].append(value @ np.linalg.inv(covariance) @ value / len(value))
+    return seen
+
+
+@pytest.mark.parametrize("name", [FAULTS, FLOW])
+def test_uncertainty_is_of_the_filter_inside_the_environment(name):
+    """CRPS, coverage and var/MSE equal their formulas for mean, standard deviation and truth at the truth nodes of the
+    scored region; NIS/m is the mean over the injections with accepted measurements."""
+    played = runner.run_method(
+        Environment(name, json.dumps(world(name) | {"estimator": "reduced"})),
+        load_method("random_pair", "injection"), SEED)
+    seen = seen_in_a_separate_environment(name, played.currents)
+    env = make("reduced", name).unwrapped
+    mesh = env.world.truth_model().transport.mesh
+    onto = env.task.mesh.interpolation_to(mesh.points)
+    mass = mass_between(mesh, *env.world.region) if env.world.region else mass_matrix(mesh)
+    weights = np.asarray(mass.sum(axis=0)).ravel()
+    claim = [np.array([onto @ state for state in seen[key]]) for key in ("mean", "std")]
+    claim = [*claim, np.array(seen["truth"]), weights]
+    said = compute_scores("injection", played.outcome)
+    assert played.outcome.errors.tolist() == seen["error"]
+    assert 0 < len(seen["nis"]) <= len(seen["error"]) == env.world.schedule.scored_steps
+    expected = {"nis": np.mean(seen["nis"]), "crps": scoring.crps(*claim),
+                "coverage_50": scoring.coverage(*claim, 0.5),
+                "coverage_90": scoring.coverage(*claim, 0.9),
+                "spread_ratio": scoring.spread_ratio(*claim)}
+    assert {key: said[key] for key in expected} == pytest.approx(expected, rel=1e-9)
+    assert 0.0 < said["crps"] < env.world.expected_concentration
+
+
+def test_only_accepted_measurements_count():
+    """Two accepted measurements and then one: (4/1 + 4/4)/2 = 2.5 and 9/1 = 9 have the mean 5.75."""
+    innovations = ([np.array([2.0, 2.0]), np.array([3.0])], [np.diag([1.0, 4.0]), np.eye(1)])
+    outcome = Outcome(entry(NAME).world, 0.0, np.ones(2), innovations=innovations)
+    assert compute_scores("injection", outcome)["nis"] == pytest.approx(5.75)
+
+
+def test_policies_do_not_observe_scored_quantities():
+    env = make("reduced")
+    observation, info = env.reset(seed=SEED)
+    known = set(observation)
+    observation, *_, later = env.step(7)
+    assert set(observation) == known == set(env.observation_space.spaces)
+    assert set(info) == set(later) == {"step"}

@@ -21,7 +21,7 @@ from eitbench.worlds.catalogue import PIPE_2D
 from eitbench.worlds.task import Estimate, Task
 from scipy.optimize import minimize_scalar
 
-from recorded import forget_made
+from shapes import integral_of_square, values_at
 from short import FAST, merged
 from tiny import FILTER, FIXED_LAG, SMOOTHING, count, counting, write_baseline
 
@@ -242,7 +242,7 @@ def test_estimators_cannot_change_the_task_of_others(tmp_path, good):
     try:
         assert scores_of(run_episode(Job(FILTER, good[0], 1))[0]) == good[1]
     finally:
-        forget_made(runner)                                    # remake the modified environment for other tests
+        runner._cached_environment.cache_clear()               # remake the modified environment for other tests
 
 
 @pytest.mark.parametrize(("environment", "board"), [(FILTER, "filter"), (FIXED_LAG, "fixed-lag"),
@@ -274,34 +274,13 @@ def tilted(tmp_path_factory):
         return result, store.fields(result)["mean"].astype(float), simulate(PIPE_2D.with_changes(FAST), 4)
 
 
-def squared(mesh, values):
-    """Compute ∫f² of P1 fields (T, n) by the exact rule on each triangle, area/6·(a² + b² + c² + ab + bc + ca)."""
-    a, b, c = (values[:, corner] for corner in mesh.cells.T)
-    p, q, r = mesh.points[mesh.cells].transpose(1, 0, 2)
-    area = 0.5 * np.abs((q - p)[:, 0] * (r - p)[:, 1] - (q - p)[:, 1] * (r - p)[:, 0])
-    return (a * a + b * b + c * c + a * b + b * c + c * a) @ area / 6
-
-
-def interpolated(mesh, values, points):
-    """Interpolate P1 fields (T, n) at points (k, 2), in the triangle that contains each point."""
-    p, q, r = mesh.points[mesh.cells].transpose(1, 0, 2)
-    to_barycentric = np.linalg.inv(np.stack([q - p, r - p], axis=2))
-    result = np.empty((len(values), len(points)))
-    for k, point in enumerate(points):
-        s, t = np.einsum("cij,cj->ic", to_barycentric, point - p)
-        weights = np.stack([1 - s - t, s, t])
-        cell = weights.min(axis=0).argmax()
-        result[:, k] = values[:, mesh.cells[cell]] @ weights[:, cell]
-    return result
-
-
 def test_scores_can_be_recomputed_from_what_is_stored(tilted):
     """Relative and contrast error are recomputed from the stored estimates and the simulated truth, by other code."""
     result, means, episode = tilted
     env = FILTER.make()
     mesh, truth = truth_mesh(env.world), episode.concentration[1:].astype(float)
-    error = squared(mesh, interpolated(env.task.mesh, means, mesh.points) - truth)[2:]
-    steps = error / squared(mesh, truth)[2:]
+    error = integral_of_square(mesh, means @ values_at(mesh.points, env.task.mesh).T - truth)[2:]
+    steps = error / integral_of_square(mesh, truth)[2:]
     np.testing.assert_allclose(result["step_errors"], steps, rtol=1e-9)
     assert result["scores"]["error"] == pytest.approx(steps.mean(), rel=1e-9)
 
@@ -313,7 +292,7 @@ def test_scores_can_be_recomputed_from_what_is_stored(tilted):
         return (((voltages - computed) / env.world.noise.std(voltages))**2).sum()
 
     homogeneous = minimize_scalar(misfit, bounds=(20.0, 40.0), method="bounded", options={"xatol": 1e-7}).x
-    contrast = (error / squared(mesh, truth - homogeneous)[2:]).mean()
+    contrast = (error / integral_of_square(mesh, truth - homogeneous)[2:]).mean()
     assert result["scores"]["contrast_error"] == pytest.approx(contrast, rel=1e-5)
     computed = np.array([env.task.observation.voltages(means[i], currents[i:i + 1])[0] for i in range(5)])
     assert result["scores"]["voltage_discrepancy"] == pytest.approx(((voltages - computed)[2:]**2).mean(), rel=1e-9)

@@ -16,7 +16,7 @@ from eitbench.report.site import collect, render, render_site
 from eitbench.report.tables import run_table
 from eitbench.worlds import entry
 
-from tables import said
+from tiny import said
 
 PUBLISHED = Path(__file__).parents[2] / "leaderboards" / "results"
 WORLD = entry("eitbench/Pipe2D-v0").world
@@ -24,7 +24,6 @@ WORLD = entry("eitbench/Pipe2D-v0").world
 
 @pytest.fixture
 def apart(monkeypatch):
-    """Remove registrations of a test after it."""
     monkeypatch.setattr(scores, "_scores", dict(scores.scores()))
 
 

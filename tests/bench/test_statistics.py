@@ -38,7 +38,6 @@ def two_methods(seed=5):
 
 
 def plain(scores):
-    """Return environment -> list of scores."""
     return {environment: list(own.values()) for environment, own in scores.items()}
 
 
@@ -176,7 +175,6 @@ PIPE_AND_TANK = {"b": {"pipe": seeded(np.ones(6)), "tank": seeded(np.zeros(60))}
     # four better episodes are not significant: for equal methods the probability is 1/8
     (board(a=NOISE[:4], b=NOISE[:4] + 1), {}, {"a": 1, "b": 1})])
 def test_shared_ranks(scores, how, expected):
-    """Rank and order of each method are as expected."""
     assert list(shared_ranks(scores, **how).items()) == list(expected.items())
 
 
@@ -212,12 +210,10 @@ def test_ranks_agree_with_the_definition(statistic, higher):
 
 @pytest.mark.parametrize(("call", "message"), [
     (lambda: interquartile_mean(), "scores must hold"),
-    (lambda: interquartile_mean([]), "scores must hold"),
     (lambda: mean_over_environments([1.0], []), "scores must hold"),
     (lambda: stratified_bootstrap({"pipe": NOISE}, np.mean), "statistic must reduce the last axis only"),
     (lambda: stratified_bootstrap({"pipe": NOISE}, interquartile_mean, n_resamples=0), "n_resamples must be"),
     (lambda: stratified_bootstrap({}, interquartile_mean), "scores must be finite"),
-    (lambda: stratified_bootstrap({"pipe": []}, interquartile_mean), "scores must be finite"),
     (lambda: stratified_bootstrap({"pipe": np.ones((3, 3))}, interquartile_mean), "scores must be finite"),
     (lambda: stratified_bootstrap({"pipe": [1.0, math.nan]}, interquartile_mean), "scores must be finite"),
     (lambda: paired_difference({"pipe": seeded(NOISE)}, {"pipe": seeded(NOISE, "dev")}), "compared methods share"),
@@ -229,6 +225,5 @@ def test_ranks_agree_with_the_definition(statistic, higher):
     (lambda: shared_ranks({"a": {"pipe": {}}}), "scores must be finite"),
 ])
 def test_errors_name_the_argument(call, message):
-    """The message explains the reason."""
     with pytest.raises(ValueError, match=message):
         call()

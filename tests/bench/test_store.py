@@ -1,9 +1,12 @@
-"""Results on disk: atomic writes, concurrent writers, and records with all data for a rerun."""
+"""Results on disk: atomic writes, records with all data for a rerun, and damaged files, which are reported; table and
+page show the rest."""
 
+import json
 import math
 import platform
 import re
 import shlex
+import shutil
 from types import SimpleNamespace
 
 import numpy as np
@@ -15,6 +18,7 @@ from eitbench.bench.store import EpisodeStore, portable_command, provenance, rec
 from eitbench.data.cache import CACHE_VARIABLE
 from eitbench.data.seeds import format_seed
 
+from commands import eitbench
 from short import FAST
 from tiny import FILTER, RUN, git_says, record, sha, write_baseline
 
@@ -56,9 +60,17 @@ def played(tmp_path_factory):
         git_says(patch, "c0ffee")
         mine = write_baseline(folder, parameters="{'alpha': 0.5, 'order': [1, 2]}")
         bad = write_baseline(folder, "bad", update="raise RuntimeError('no')")
-        run_jobs([Job(FILTER, path, seed) for path in (mine, bad) for seed in (1, 2)], EpisodeStore(folder),
-                 command=COMMAND)
-    return EpisodeStore(folder)
+        store = EpisodeStore(folder / "results")
+        run_jobs([Job(FILTER, path, seed) for path in (mine, bad) for seed in (1, 2)], store, command=COMMAND)
+    return store
+
+
+@pytest.fixture
+def damaged(played, monkeypatch, tmp_path):
+    """Return a copy of that folder, which a test may damage, and its folder of the first estimator."""
+    monkeypatch.chdir(tmp_path)
+    store = EpisodeStore(shutil.copytree(played.folder, tmp_path / "results"))
+    return store, store.folder / "episodes" / FILTER.name / "mine"
 
 
 def test_records_can_be_reproduced(played):
@@ -158,8 +170,52 @@ def test_other_results_fill_what_is_missing_or_failed(store):
 
 
 def test_provenance_without_git(monkeypatch):
-    """Without a repository the commit is None."""
     monkeypatch.undo()
     monkeypatch.setenv("PATH", "")
     provenance.cache_clear()
     assert (provenance()["commit"], provenance()["dirty"]) == (None, None)
+
+
+@pytest.mark.parametrize(("field", "value"), [
+    ("finished", None), ("scores", None), ("scores", {"error": "x"}), ("step_errors", 7), ("step_errors", ["a"]),
+    ("environment", "Pipe2D"), ("environment", {"id": 5, "name": "a", "kwargs": {}}), ("run", {}), ("run", None),
+    ("method", ["mine"]), ("seed", 7), ("version", None), ("scores", {"error": 10**400}),
+    ("scores", {"error": 0.1, "seconds_per_step": -1.0}),
+    *((None, text) for text in ("", "{", "[]", "{}", "3", None))])
+def test_a_damaged_result_is_reported_and_the_others_are_kept(field, value, damaged):
+    """Any value in place of a text, a number, an object or the file is handled, and a folder."""
+    store, folder = damaged
+    path = folder / "train-1.json"
+    content = json.dumps(json.loads(path.read_text()) | {field: value}) if field else value
+    path.unlink()
+    path.mkdir() if content is None else path.write_text(content)
+    with pytest.warns(UserWarning, match=r"mine/train-1\.json is left out: it (cannot be read|is not (an ep|valid))"):
+        records = store.write_records()
+        assert not store.has_result(FILTER.name, "mine", 1, "any")
+    assert {record["method"]: record["seeds"] for record in records} == {
+        "bad": ["train:1", "train:2"], "mine": ["train:2"]}
+
+
+@pytest.mark.parametrize("damage", [
+    lambda data: data[:len(data) // 2], lambda data: b"", lambda data: b"PK", lambda data: data[:200] + data[300:],
+    lambda data: b"\x93NUMPY", lambda data: data.replace(b"mean.npy", b"main.npy"),
+    # marked as encrypted
+    lambda data: re.sub(rb"(PK\x01\x02.{4}).", lambda found: found[1] + b"\x01", data, flags=re.DOTALL)])
+def test_damaged_estimates_are_named(damage, damaged):
+    store, folder = damaged
+    (found,) = [each for each in store.results() if (each["method"], each["seed"]) == ("mine", "train:1")]
+    path = folder / "train-1.npz"
+    path.write_bytes(damage(path.read_bytes()))
+    with pytest.raises(ValueError, match=r"estimates .*mine/train-1\.npz"):
+        store.fields(found)
+
+
+@pytest.mark.parametrize("fields", [
+    {"mean": np.zeros(3)}, {"mean": np.array([["a"]])}, {"std": np.zeros((5, 7))}])
+def test_estimates_of_another_shape_are_not_drawn(fields, damaged):
+    """Table and page are written without figures."""
+    for path in damaged[1].glob("*.npz"):
+        np.savez(path, **fields)
+    with pytest.warns(UserWarning, match="no pictures of train:1"):
+        code, said, complaint = eitbench("leaderboard")
+    assert code == 0 and "| mine" in said, complaint

@@ -11,7 +11,6 @@ import pytest
 from eitbench.bench import held_out, isolation, methods, run
 from eitbench.bench import verify as verification
 from eitbench.bench.held_out import held_out_seeds, p_value, read_secret
-from eitbench.bench.isolation import bubblewrap_problem
 from eitbench.bench.records import read_record, write_record
 from eitbench.bench.run import Job, run_episode
 from eitbench.bench.verify import score_differences
@@ -20,9 +19,8 @@ from eitbench.data.episodes import simulate
 from eitbench.data.seeds import SPLITS, parse_seeds
 
 from commands import eitbench
-from short import shorten
-from tiny import FILTER, SMOOTHING, git_says, write_baseline, write_policy
-from tiny_worlds import TINY
+from short import TINY, shorten
+from tiny import FILTER, SMOOTHING, confined, git_says, write_baseline, write_policy
 
 INJECTION = "eitbench/Pipe2DInjection-v0"
 CURRENTS = "eitbench/Pipe2DInjectionCurrents-v0"
@@ -30,7 +28,6 @@ SECRET = bytes(range(32))
 AGREE = "1 of 1 records agree"
 HERE = ("-j", 1, "--isolate", "process")
 REDUCED = ("--seeds", "dev:0", "--estimator", "reduced", "-j", 1)
-confined = pytest.mark.skipif(bool(bubblewrap_problem()), reason=bubblewrap_problem() or "bubblewrap works")
 
 
 @pytest.fixture(autouse=True)
@@ -91,20 +88,19 @@ def submission(tmp_path_factory):
 
 @pytest.fixture
 def own(submission, tmp_path):
-    """Return the path of a copy of that record."""
     shutil.copytree(submission, tmp_path / "board")
     (path,) = Path("board/results").glob("*.json")
     return path
 
 
 def test_a_valid_record_agrees():
-    """Episodes are simulated again and chosen by the seed; the output is a Markdown table."""
+    """Episodes are simulated again and chosen by the seed; the output is a Markdown table, also of stored results."""
     path = submitted("homogeneous", "test:0-3")
-    command = ("verify", path, "--episodes", 2, "--seed", 5, "-j", 1)
+    command = ("verify", path, "--episodes", 2, "--seed", 5, "-j", 1, "--out", "again")
     code, said, complaint = eitbench(*command)
     assert code == 0 and AGREE in said and "--seed 5" in said, complaint
     assert len(re.findall(r"\| test:\d +\| none +\|.*\| none +\|", said)) == 2
-    assert eitbench(*command)[1] == said
+    assert eitbench(*command)[1] == f"2 of 2 episodes are already stored\n{said}"
     table = verification.verify([path], Path("again"), episodes=2, seed=6)
     assert list(table["episode"]) != re.findall(r"test:\d", said)
 
@@ -291,7 +287,6 @@ def test_held_out_seeds_are_the_formula():
 
 
 def test_a_secret_is_private_and_committed():
-    """The secret is a private file, and its hash is committed."""
     assert read_secret(write_secret()) == SECRET
     for secret, mode, message in ((bytes(32), 0o600, "commits to"), (SECRET, 0o640, "by its owner only"),
                                   (b"short", 0o600, "must have 32 bytes, got 5")):

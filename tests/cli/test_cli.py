@@ -101,7 +101,6 @@ def test_suites():
 
 @pytest.fixture
 def module(tmp_path):
-    """A file that registers a world."""
     (tmp_path / "my_world_of_tests.py").write_text(WORLD)
     yield "my_world_of_tests"
     sys.modules.pop("my_world_of_tests", None)
@@ -142,7 +141,6 @@ def test_list():
 
 
 def test_every_option_has_a_help():
-    """All commands, arguments and options have help texts."""
     assert all(name in eitbench("-h")[1] for name in COMMANDS)
     for name, command in (COMMANDS | COMMANDS["fit"].commands).items():
         assert command.help, name
@@ -151,7 +149,6 @@ def test_every_option_has_a_help():
 
 
 def test_version():
-    """The version is the version of the installed package."""
     assert eitbench("--version")[:2] == (0, f"eitbench {__version__}\n")
 
 
@@ -180,9 +177,7 @@ def test_documented_commands_are_commands():
     (["run", "--seeds", "0-3"], "seeds must have a split: train:0-3, dev:0-3 or test:0-3; got '0-3'"),
     (["run", "--env", "eitbench/pip2D-v0"], "Did you mean eitbench/Pipe2D-v0?"),
     (["run", "--env", "Pipe2D"], "Did you mean eitbench/Pipe2D-v0?"),
-    (["run", "--baseline", "kalman_fliter"], "Did you mean kalman_filter?"),
     (["run", "--set", "instrument.noise_relativ=0.1"], "Did you mean noise_relative?"),
-    (["compare", "kalmann_filter", "homogeneous"], "Did you mean kalman_filter?"),
     (["run", "--baseline", "nowhere.py"], "baseline nowhere.py does not exist"),
     (["run", "--baseline", "mine.py", "--baseline", "other/mine.py", "--seeds", "dev:1", "-j", "1"], "other/mine.py"),
     (["run", "--baseline", "empty.py"], "empty.py must define a class Estimator with a method update"),
@@ -199,6 +194,7 @@ def test_documented_commands_are_commands():
     (["run", "--env", INJECTION, "--baseline", "kalman_filter"], "one run must be of estimators or of injection"),
     (["run", "--env", INJECTION, "--records", "nowhere"], "--records must be a folder, got nowhere"),
     (["policies", "--env", "x"], "use `eitbench run --env ID --policy NAME`"),
+    (["bank", "-j", "0"], "--jobs"),
     (["bank", "--env", PIPE, "--seeds", "dev:0", "--seeds", "dev:1"], "--seeds may be given once, got 2 times"),
     (["fit", "prior", "--env", PIPE, "-o", "a", "--out", "b"], "--out may be given once, got 2 times"),
     (["bank", "--env", "nowhere:mine/Fast-v0"],
@@ -208,7 +204,6 @@ def test_documented_commands_are_commands():
     (["verify", "r.json", "--all"], "one of the files of records, --all and --top must be given"),
     (["verify", "r.json", "s.json", "--method", "a.py"], "--method belongs to one record's file"),
     (["verify", "r.json", "--held-out", "3"], "--held-out and --secret belong together"),
-    (["verify", "r.json", "--secret", "salt"], "--held-out and --secret belong together"),
     (["verify", "r.json", "--episodes", "0"], "--episodes must be at least 1 without --held-out"),
     (["verify", "r.json", "--held-out", "3", "--secret", "none"], "must be a file of hexadecimal"),
     (["verify", "r.json"], "records must be files, got r.json"),

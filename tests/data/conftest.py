@@ -6,7 +6,7 @@ from eitbench.data.cache import CACHE_VARIABLE
 from eitbench.data.episodes import simulate, simulate_batch
 
 from recorded import forget
-from tiny_worlds import TINY
+from short import TINY
 
 
 @pytest.fixture

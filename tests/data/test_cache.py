@@ -16,7 +16,7 @@ from eitbench.worlds import flows
 from eitbench.worlds.flows import LaminarFlow
 
 from recorded import forget
-from tiny_worlds import TINY
+from short import TINY
 
 RNG = np.random.default_rng(3)
 ARRAYS = {"small": RNG.normal(size=(3, 2)), "large": RNG.normal(size=401).astype(np.float32),
@@ -90,7 +90,6 @@ def test_any_flipped_byte_is_noticed():
 
 
 def test_concurrent_writers(place):
-    """Eight threads with one key all get complete arrays, and one file remains."""
     together = threading.Barrier(8)
 
     def use(_):

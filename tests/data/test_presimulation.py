@@ -19,8 +19,7 @@ from joblib.externals.loky import get_reusable_executor
 
 from commands import eitbench as command
 from recorded import forget
-from short import DRAWN, PLAIN, shorten
-from tiny_worlds import TINY
+from short import DRAWN, PLAIN, TINY, shorten
 
 SEEDS = range(4)
 """A full batch of `small_batches` and a remainder."""
@@ -35,7 +34,6 @@ def place(place, monkeypatch):
 
 @pytest.fixture
 def small_batches(monkeypatch):
-    """Simulate three episodes in a batch."""
     monkeypatch.setattr(presimulation, "BATCH_SIZE", 3)
 
 
@@ -46,7 +44,6 @@ def alone():
 
 
 def stamps(place):
-    """Return the files with their modification times."""
     return {path.name: (path.stat().st_ino, path.stat().st_mtime_ns) for path in place.iterdir()}
 
 
@@ -134,18 +131,6 @@ def test_full_disk_is_refused_before_anything_is_simulated(place, asked, monkeyp
     free[0] += 1
     for seeds, made in (("train:0", [0]), ("train:0-1", [1])):
         assert command("bank", "--seeds", seeds, "-j", "1")[0] == 0 and asked[-1] == made
-
-
-@pytest.mark.parametrize(("arguments", "message"), [
-    (["--seeds", "exam:1"], "seeds must name one of the splits train, dev, test, got 'exam:1'"),
-    (["--env", "eitbench/Pipe4D-v0"], "env must be one of eitbench/Pipe"),
-    (["-j", "0"], "--jobs"),
-])
-def test_mistakes_are_explained(arguments, message, place, asked):
-    """An invalid argument leads to exit code 2 and a sentence with its name, without a traceback or simulation."""
-    code, said, complaint = command("bank", *arguments)
-    assert code == 2 and said == "" and message in complaint and "Traceback" not in complaint
-    assert asked == [] and not place.exists()
 
 
 def test_pool_grows_with_the_resets():

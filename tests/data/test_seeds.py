@@ -11,7 +11,6 @@ numbers = st.integers(0, 99_999)
 
 
 def test_splits_are_disjoint():
-    """Splits for training, selection and scores are disjoint."""
     assert list(SPLITS) == ["train", "dev", "test"]
     assert len(set().union(*SPLITS.values())) == sum(map(len, SPLITS.values()))
 

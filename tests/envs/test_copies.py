@@ -11,10 +11,10 @@ import pytest
 from estimation_envs import LAGGED, PIPE, SKEWED
 
 from injection_envs import FAULTS, FLOW, INFLOW, NAME
-from short import WANDERING, short
+from short import DRAWN, short
 
 KINDS = [(LAGGED, {}), (SKEWED, {}), (NAME, {}), (NAME, {"estimator": "full", "observation": "raw"}), (FAULTS, {}),
-         (FLOW, {}), (FLOW, {"estimator": "full", "world": WANDERING}), (INFLOW, {}), (INFLOW, {"estimator": "full"})]
+         (FLOW, {}), (FLOW, {"estimator": "full", "world": DRAWN}), (INFLOW, {}), (INFLOW, {"estimator": "full"})]
 COPIES = {"deepcopy": copy.deepcopy, "pickle": lambda env: pickle.loads(pickle.dumps(env))}
 
 
@@ -82,7 +82,6 @@ def test_vector_environments(name, given, how):
 
 
 def test_in_another_process(tmp_path):
-    """A pickled environment continues in another process."""
     env, actions = begun(NAME, {})
     (tmp_path / "env").write_bytes(pickle.dumps((env, actions)))
     code = (f"import pathlib, pickle, sys\nimport eitbench\nhere = pathlib.Path({str(tmp_path)!r})\n"

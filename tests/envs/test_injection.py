@@ -1,4 +1,5 @@
-"""Injection environments: observations, rewards, frames and errors, single and vectorised."""
+"""Injection environments: observations, rewards, frames and errors, single and vectorised; allowed injections, and
+their voltages from an instrument with faults."""
 
 import eitbench
 import gymnasium as gym
@@ -7,8 +8,12 @@ import pytest
 from eitbench.data.episode_cache import cached_episode, cycle_voltages
 from eitbench.estimation.onboard.linearisation import electrode_pairs
 from eitbench.estimation.onboard.reduced_filters import ReducedFilters
+from eitbench.estimation.onboard.rules import Rules
+from eitbench.worlds.catalogue import PIPE_2D
+from eitbench.worlds.instrument import Faults, Instrument
 
-from injection_envs import BUDGET, CURRENTS, FAULTS, FLOW, INFLOW, NAME, filter_of, make, some_pairs
+from injection_envs import BUDGET, CURRENTS, FAULTS, FLOW, INFLOW, NAME, filter_of, make, play, some_pairs
+from shapes import integral_of_square
 from short import world
 
 OTHER_FILTERS = (FLOW, INFLOW, *(f"eitbench/{name}-v0" for name in (
@@ -47,15 +52,6 @@ def test_voltages_are_those_of_the_pair():
         assert over == (t == base.world.n_steps - 1)
 
 
-def integrated(mesh, values: np.ndarray, region: tuple[float, float]) -> float:
-    """Return ∫values² over the region of a field linear in each cell, by its values at the midpoints of the sides."""
-    x = mesh.points[mesh.cells][..., 0]
-    inside = (x.min(axis=1) > region[0] - 1e-9) & (x.max(axis=1) < region[1] + 1e-9)
-    corner = values[mesh.cells[inside]]
-    middles = 0.5 * (corner + np.roll(corner, 1, axis=1))
-    return float((mesh.volumes[inside] * (middles**2).mean(axis=1)).sum())
-
-
 @pytest.mark.parametrize(("estimator", "name"), [("reduced", INFLOW), ("reduced", FLOW), ("full", NAME)])
 def test_reward_is_the_decrease_of_the_error(estimator, name):
     """The reward equals ∫(ĉ_bh − c)²/∫c² − ∫(ĉ − c)²/∫c² over the region's cells of the truth's
@@ -80,9 +76,10 @@ def test_reward_is_the_decrease_of_the_error(estimator, name):
             assert reward == 0.0
             assert base.error is None and "error" not in info
             continue
-        square = integrated(mesh, truth[t], region)
+        square = integral_of_square(mesh, truth[t], region)
         estimate = base.core.estimate()[0][0]
-        homogeneous, error = (integrated(mesh, onto @ c - truth[t], region) / square for c in (level, estimate))
+        homogeneous, error = (integral_of_square(mesh, onto @ c - truth[t], region) / square
+                              for c in (level, estimate))
         assert base.error == info["error"] == pytest.approx(error, rel=1e-5)
         assert reward == pytest.approx(homogeneous - error, rel=1e-5)
         paid += 1
@@ -135,7 +132,6 @@ def test_vectorised_as_single(name, estimator, observation, n):
 
 
 def test_episodes_are_independent_with_the_full_filter():
-    """An episode is bit-identical alone and together with another one."""
     alone, beside = (make_many(FAULTS, n, estimator="full") for n in (1, 2))
     shown = [(alone.reset(seed=[0])[0], beside.reset(seed=[0, 1])[0])]
     for action in (7, 40):
@@ -148,7 +144,6 @@ def test_episodes_are_independent_with_the_full_filter():
 
 
 def test_an_estimate_that_is_not_finite_is_an_error(monkeypatch):
-    """The step raises an error that names the episodes."""
     errors = ReducedFilters.errors
 
     def broken(self, *recorded):
@@ -205,3 +200,150 @@ def test_wrong_actions_are_named():
 def test_episodes_are_longer_than_the_first_frame():
     with pytest.raises(ValueError, match=r"world.schedule must have more time steps than the cycle of 16 .* got 5"):
         gym.make(FAULTS, world={"schedule": {"warm_up": 1, "scored_steps": 4}})
+
+
+@pytest.mark.parametrize(("limit", "order"), [("L1", 1), ("L2", 2), ("Linf", np.inf)])
+def test_currents_are_projected(limit, order):
+    """Currents sum to zero; within the limit they are only centred, otherwise scaled to a pair's norm."""
+    rules = Rules(PIPE_2D.with_changes({"instrument": {"current_norm": limit}}))
+    assert rules.limit == limit
+    free = np.random.default_rng(0).uniform(-1.0, 1.0, (50, 16))
+    free *= np.geomspace(0.01, 1.0, 50)[:, None]
+    currents = rules.currents(free)
+    np.testing.assert_allclose(currents.sum(axis=1), 0.0, atol=1e-15)
+    pair = np.linalg.norm(np.array([0.1, -0.1]), order)
+    size = np.linalg.norm(currents, order, axis=1)
+    centred = 0.1 * (free - free.mean(axis=1, keepdims=True))
+    within = np.linalg.norm(centred, order, axis=1) <= pair
+    assert 0 < within.sum() < 50
+    np.testing.assert_allclose(currents[within], centred[within], rtol=1e-12)
+    np.testing.assert_allclose(size[~within], pair, rtol=1e-12)
+    across = np.cross(currents[~within][:, :3], centred[~within][:, :3])
+    np.testing.assert_allclose(across, 0.0, atol=1e-15)
+
+
+def test_a_pair_and_its_currents_are_the_same():
+    pair = make("reduced", longer={"instrument": {"noise_floor": 2e-4}})
+    free = make("reduced", CURRENTS)
+    for env in (pair, free):
+        env.reset(seed=1)
+    for action in some_pairs()[:3]:
+        currents = np.zeros(16, dtype=np.float32)
+        currents[electrode_pairs(16)[action]] = 1.0, -1.0
+        a, b = pair.step(int(action))[0], free.step(currents)[0]
+        for key, array in a.items():
+            np.testing.assert_allclose(b[key], array, rtol=1e-5, atol=1e-5, err_msg=key)
+
+
+def test_budget_limits_the_number_of_injections():
+    """Only injections count; without one, or beyond the budget, the estimate is not updated."""
+    env = make("reduced", BUDGET, longer={"schedule": {"scored_steps": 8, "budget": 2}})
+    observation, _ = env.reset(seed=1)
+    left = [observation["left"][1]]
+    for action in (120, 7, 120, 33, 40, 41):
+        before = observation
+        observation = env.step(action)[0]
+        left.append(observation["left"][1])
+        flowed = action != 120 and left[-2] > 0
+        for key in ("currents", "voltages", "innovations"):
+            assert observation[key].any() == flowed
+        if not flowed:
+            assert observation["std"].sum() > before["std"].sum()
+        masks = env.unwrapped.action_masks()
+        assert masks[120]
+        assert (masks[:120] == (left[-1] > 0)).all()
+    assert left == [2, 2, 1, 1, 0, 0, 0]
+    assert env.unwrapped.core.n_injections == [2]
+
+
+def test_dead_electrodes_measure_interference_and_carry_no_current():
+    """A broken wire measures interference and carries no current; other voltages are 𝓡 I."""
+    instrument = Instrument(n_dead_range=(3, 3), n_failing_range=(2, 2), n_loose_range=(2, 2), interference=0.5)
+    noise = instrument.noise
+    assert noise == PIPE_2D.noise
+    rng = np.random.default_rng(0)
+    faults = instrument.draw(rng, 16, 50)
+    broken = faults.open_circuit_from
+    assert (broken == 0).sum() == 3
+    assert ((broken > 0) & (broken <= 50)).sum() == 2
+    assert (faults.resistance > 0).sum() == 2
+    assert not ((faults.resistance > 0) & (broken <= 50)).any()
+    root = rng.normal(size=(16, 16))
+    R = root @ root.T
+    stacked = Faults(*(part[None] for part in faults))
+    zero = np.zeros((1, 16))
+    draws = rng.normal(size=(1, 16))
+
+    def read(t, currents, draws):
+        return instrument.measure(stacked, t, R[None], currents, draws)[0]
+
+    sound = np.flatnonzero(broken > 50)
+    i, j = sound[:2]
+    currents = np.zeros((1, 16))
+    currents[0, [i, j]] = 0.1, -0.1
+    wanted = R @ currents[0] + faults.resistance * currents[0]
+    clean = read(50, currents, zero)
+    np.testing.assert_allclose(clean[sound], wanted[sound], rtol=1e-14)
+    assert not clean[broken <= 50].any()
+    noisy = read(50, currents, draws)
+    np.testing.assert_allclose(noisy[broken <= 50], 0.5 * draws[0, broken <= 50])
+    added = noise.std(wanted) * faults.noise_factor * draws[0]
+    np.testing.assert_allclose((noisy - clean)[sound], added[sound])
+    late = int(np.flatnonzero((broken > 0) & (broken <= 50))[0])
+    currents[0] = 0.0
+    currents[0, [i, late]] = 0.1, -0.1
+    assert read(broken[late] - 1, currents, zero)[i] != 0.0
+    assert not read(broken[late], currents, zero).any()
+
+
+def test_a_noise_floor_adds_to_the_noise():
+    """The noise floor adds in quadrature; without a current it is the only noise."""
+    rng = np.random.default_rng(1)
+    instrument = Instrument(noise_floor=2e-3)
+    root = rng.normal(size=(16, 16))
+    R = root @ root.T
+    currents = np.zeros((3, 16))
+    currents[:2, [0, 5]] = 0.1, -0.1
+    draws = rng.normal(size=(3, 16))
+    steps = np.arange(1, 4)
+    none = instrument.draw(rng, 16, 3)
+    read = instrument.measure(none, steps, np.repeat(R[None], 3, axis=0), currents, draws)
+    clean = currents @ R
+    std = np.hypot(instrument.noise.std(clean), 2e-3)
+    np.testing.assert_allclose(read, clean + std * draws, rtol=1e-12)
+    np.testing.assert_allclose(read[2], 2e-3 * draws[2], rtol=1e-12)
+    np.testing.assert_allclose(instrument.model_noise.std(clean), std, rtol=1e-12)
+
+
+def test_faults_depend_on_the_seed_alone_and_are_shown_by_doubt():
+    """Equal seeds have equal faults; high fault scores indicate electrodes with a fault after some steps."""
+    faults = {"n_dead_range": [3, 3], "n_failing_range": [0, 0], "n_loose_range": [0, 0]}
+    longer = {"instrument": faults, "schedule": {"scored_steps": 16}}
+    env = make("reduced", FAULTS, longer=longer)
+    base = env.unwrapped
+    steps = play(env, 4, some_pairs())
+    broken = np.flatnonzero(base.core.faults.open_circuit_from[0] == 0)
+    np.testing.assert_equal(play(env, 4, some_pairs()), steps)
+    doubt = steps[-1][0]["doubt"][0]
+    assert set(np.flatnonzero(doubt > 0.5)) <= set(broken)
+    assert len(broken) == 3
+    assert doubt[broken].mean() > 0.3
+    env.reset(seed=5)
+    assert set(np.flatnonzero(base.core.faults.open_circuit_from[0] == 0)) != set(broken)
+
+
+@pytest.mark.parametrize(("limit", "kind"), [("L1", np.float16), ("L2", np.float32), ("Linf", np.float64)])
+def test_the_largest_currents_are_those_at_the_bounds(limit, kind):
+    """Finite currents are scaled to the instrument's limit without overflow."""
+    largest = np.finfo(kind).max
+    longer = {"instrument": {"current_norm": limit}}
+    env, other = (make("reduced", CURRENTS, longer=longer).unwrapped for _ in range(2))
+    signs = np.random.default_rng(3).choice([-1.0, 1.0], (env.core.length, 16))
+    env.reset(seed=1)
+    other.reset(seed=1)
+    for sign in signs:
+        seen, reward, *_ = env.step((largest * sign).astype(kind))
+        assert env.observation_space.contains(seen) and np.isfinite(reward)
+        expected, paid, *_ = other.step(sign)
+        np.testing.assert_equal(seen, expected)
+        assert reward == paid

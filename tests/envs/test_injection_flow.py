@@ -52,7 +52,6 @@ def test_without_a_region_all_counts(env):
 
 
 def test_recordings_hold_the_integrals(monkeypatch, tmp_path):
-    """Cached integrals are bit-identical to integrals of the truth."""
     monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path))
     narrow = {"flow": {"velocity_range": [44.5, 45.5]}, "schedule": {"scored_steps": 3}}
     world = PIPE_2D_DRIFTING.with_changes(WANDERING).with_changes(narrow)

@@ -9,7 +9,6 @@ MESH = extrude(uniform_disc(1.0, 8), np.linspace(-1.0, 1.0, 17))
 
 
 def area(triangles):
-    """Return the total area of the triangles."""
     a, b = triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]
     return 0.5 * np.linalg.norm(np.cross(a, b), axis=1).sum()
 
@@ -32,6 +31,5 @@ def test_surface_of_a_distance_is_a_sphere():
 
 
 def test_nothing_beyond_the_extremes():
-    """A level outside the range of values has no surface."""
     for level in (2.0, -2.0):
         assert isosurface(MESH, MESH.points[:, 0], level).shape == (0, 3, 3)

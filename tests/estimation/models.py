@@ -20,7 +20,7 @@ from eitbench.physics.transport import ConvectionDiffusion
 from eitbench.worlds.task import make_task
 from scipy.linalg import block_diag
 
-from tiny_worlds import TINY
+from short import TINY
 
 
 class LinearGaussian(NamedTuple):
@@ -149,7 +149,6 @@ class QuadraticModel:
 
 @lru_cache(maxsize=1)
 def tiny_task():
-    """Return the task of the tiny world."""
     return make_task(TINY)
 
 
@@ -206,7 +205,6 @@ HEIGHTS = np.linspace(-0.9, 0.9, 13)
 
 
 def directions(k):
-    """Return the fields of the first k profiles."""
     return [lambda points, profile=profile: np.column_stack([profile(points[:, 1] / R), np.zeros(len(points))])
             for profile in PROFILES[:k]]
 
@@ -225,7 +223,6 @@ def coarse_transport(theta, diffusivity=1e-2):
 
 @lru_cache(maxsize=2)
 def coarse_task(theta=(4.5,)):
-    """Return the task of the tiny world in the coarse pipe."""
     return replace(make_task(TINY), transport=coarse_transport(theta))
 
 
@@ -236,8 +233,19 @@ def flow_prior(initial, std, walk):
                          np.array(std), np.array(walk), shapes(k))
 
 
-def averages(mesh, random, m):
-    """Return averages (m, n) about m random points, slightly wider than a cell."""
+@lru_cache(maxsize=2)
+def coarse_prior(link="logarithm"):
+    """Return a prior of two modes across the inlet of the coarse pipe."""
+    return two_modes(MESH.points[:7], link=link)
+
+
+def averages(random, m):
+    """Return averages (m, n) about m random points of the coarse pipe, slightly wider than a cell."""
     places = random.uniform([0.0, -R], [0.4, R], (m, 2))
-    weights = np.exp(-0.5 * (((mesh.points - places[:, None]) / [0.02, 0.015])**2).sum(axis=2))
+    weights = np.exp(-0.5 * (((MESH.points - places[:, None]) / [0.02, 0.015])**2).sum(axis=2))
     return weights / weights.sum(axis=1, keepdims=True)
+
+
+def averaged(random, m=8, level=29.0, variance=0.1):
+    """Return a measurement of random averages in the coarse pipe."""
+    return LinearMeasurement(averages(random, m), level + 3.0 * random.normal(size=m), np.full(m, variance))

@@ -9,11 +9,12 @@ import numpy as np
 import pytest
 from eitbench.bench.methods import builtin_methods, load_method
 from eitbench.data.episode_cache import cached_episode, cycle_voltages
-from eitbench.data.episodes import cached_truth_model
+from eitbench.data.episodes import cached_truth_model, simulate
 from eitbench.envs.injection_core import InjectionCore
 from eitbench.estimation.body_particles import BodyParticleFilter, BodyTracker, body_model
 from eitbench.estimation.onboard.body_filters import BodyBelief
 from eitbench.estimation.onboard.rules import Rules
+from eitbench.scoring import matched_distances
 from eitbench.worlds import entry
 from eitbench.worlds.bodies import TRANSITION_WIDTH, disc_indicator
 from eitbench.worlds.random_streams import episode_streams
@@ -35,11 +36,16 @@ def rules_of(id=ID):
     return Rules(entry(id).world.with_changes(changes))
 
 
-def believed(id=ID):
+def seen(core, b=0):
+    """Return the observation of one episode of a batch."""
+    return {name: array[b] for name, array in core.observe().items()}
+
+
+def believed(id=ID, rules=None):
     """Return a core after the first frame of an episode and the belief of its observation."""
-    core = InjectionCore(rules_of(id), "reduced")
+    core = InjectionCore(rules or rules_of(id), "reduced")
     core.reset([3])
-    return core, BodyBelief(core.rules, {name: array[0] for name, array in core.observe().items()})
+    return core, BodyBelief(core.rules, seen(core))
 
 
 @pytest.mark.parametrize(("id", "centre", "limit"), [
@@ -126,16 +132,14 @@ def test_criteria_are_those_of_a_gaussian_of_images_and_voltages(id):
 def test_chosen_electrodes_are_the_most_informative_ones(count):
     """Each one maximises the A-criterion together with those before it, among all electrodes of the pair."""
     rules = Rules(rules_of(CHOSEN).world.with_changes({"instrument": {"n_voltmeters": count}}))
-    core = InjectionCore(rules, "reduced")
-    core.reset([3])
-    belief = BodyBelief(rules, {name: array[0] for name, array in core.observe().items()})
+    core, belief = believed(rules=rules)
     criteria = belief.criteria()
     every = np.tile(np.arange(16), (120, 1))
 
     def gains(electrodes):
         """Return the criteria with these electrodes (120, k) as the only ones that exist."""
         other = BodyBelief(Rules(rules.world.with_changes({"instrument": {"n_voltmeters": electrodes.shape[1]}})),
-                           {name: array[0] for name, array in core.observe().items()})
+                           seen(core))
         other._entries = tuple(np.take_along_axis(each, electrodes, axis=1) for each in other._entries)
         other._variance = np.take_along_axis(other._variance, electrodes, axis=1)
         return other.criteria()
@@ -155,13 +159,12 @@ def test_observations_may_have_the_gains_of_all_pairs(id):
     """They are the A-criteria of a policy with the same observations, for each episode of a batch."""
     core = InjectionCore(replace(rules_of(id), gains=True), "reduced")
     core.reset([3, 4])
-    beliefs = [BodyBelief(core.rules, {name: array[b] for name, array in core.observe().items()}) for b in range(2)]
+    beliefs = [BodyBelief(core.rules, seen(core, b)) for b in range(2)]
     core.act(np.array([core.rules.action(57), core.rules.action(3)]))
-    shown = core.observe()
     for b, belief in enumerate(beliefs):
-        belief.update({name: array[b] for name, array in shown.items()})
+        belief.update(shown := seen(core, b))
         expected = belief.criteria()[0]
-        np.testing.assert_allclose(shown["gains"][b], expected / expected.max(), rtol=1e-12)
+        np.testing.assert_allclose(shown["gains"], expected / expected.max(), rtol=1e-12)
 
 
 def test_neighbours_can_be_chosen():
@@ -172,7 +175,7 @@ def test_neighbours_can_be_chosen():
         action = chosen.rules.action(pair)
         np.testing.assert_array_equal(chosen.act(action[None]), fixed.act(np.array([pair])))
         np.testing.assert_array_equal(chosen._voltages, fixed._voltages)
-        belief.update({name: array[0] for name, array in chosen.observe().items()})
+        belief.update(seen(chosen))
         np.testing.assert_array_equal(belief.filters.filter.weights, chosen.filters.filter.weights)
 
 
@@ -255,7 +258,7 @@ def test_belief_is_the_filter_inside(id):
     core, belief = believed(id)
     for pair in (7, 100, 3):
         core.act(np.array([pair]))
-        belief.update({name: array[0] for name, array in core.observe().items()})
+        belief.update(seen(core))
         ours, inside = (each.filters.filter for each in (belief, core))
         np.testing.assert_equal(ours.particles, inside.particles)
         np.testing.assert_array_equal(ours.weights, inside.weights)
@@ -304,3 +307,37 @@ def test_estimate_finds_the_body():
         darkest = core.task.mesh.points[core.estimate()[0][0].argmin()]
         distances.append(np.linalg.norm(darkest - path.centres[core.t]))
     assert np.median(distances) < 0.01
+
+
+SHORT_STEPS = {"vessel": {"truth_refinement": 1}, "schedule": {"scored_steps": 24, "warm_up": 8}}
+TWO_BUBBLES = entry(TWO).world.with_changes(SHORT_STEPS)
+ONE_BUBBLE = entry(BUBBLES).world.with_changes(SHORT_STEPS)
+
+
+def test_each_body_moves_by_itself():
+    """The first one as in the world with one body; the image is the smaller concentration of the two images."""
+    one, two = (world.target.paths(world, episode_streams(4).flow) for world in (ONE_BUBBLE, TWO_BUBBLES))
+    assert len(one) == 1 and len(two) == 2
+    np.testing.assert_array_equal(one[0].centres, two[0].centres)
+    assert not np.isclose(two[0].centres, two[1].centres).any() and two[0].radius != two[1].radius
+    single, double = (simulate(world, 4, progress=False).concentration for world in (ONE_BUBBLE, TWO_BUBBLES))
+    assert (double <= single).all() and (double < 0.5 * single).any()
+
+
+@pytest.mark.parametrize(("world", "limit"), [(ONE_BUBBLE, 0.012), (TWO_BUBBLES, 0.02)], ids=["one", "two"])
+def test_the_filter_follows_bubbles(world, limit):
+    """Three pairs in turn locate most of the bubbles; the observation has the estimates of all
+    bodies."""
+    rules, seeds = Rules(world), [0, 1, 2, 3]
+    core = InjectionCore(rules, "reduced")
+    core.reset(seeds)
+    paths = [world.target.paths(world, episode_streams(seed).flow) for seed in seeds]
+    distances = []
+    for k in range(core.length):
+        core.act(np.full(len(seeds), rules.pairs.tolist().index(([2, 9], [0, 7], [5, 9])[k % 3])))
+        centres, present = (np.array([[getattr(path, name)[core.t] for path in own] for own in paths])
+                            for name in ("centres", "present"))
+        distances += matched_distances(core.filters.bodies()[..., :2], centres, present).tolist()
+    estimated = core.filters.bodies()
+    np.testing.assert_array_equal(core.observe()["body"].reshape(estimated.shape), estimated)
+    assert len(distances) > 20 * world.target.n_bodies and np.median(distances) < limit

@@ -27,6 +27,7 @@ from models import (
     LinearGaussian,
     assert_close,
     by_window,
+    coarse_prior,
     coarse_task,
     coarse_transport,
     dense_filter,
@@ -36,7 +37,6 @@ from models import (
     random_model,
     stacked,
     theta_of,
-    two_modes,
     window_law,
 )
 from scipy.linalg import block_diag
@@ -88,8 +88,7 @@ def modal():
 
 
 def inflow_window():
-    prior = two_modes(MESH.points[:7], link="linear")
-    space = InflowWindow(coarse_task(tuple(THETA)), prior, LEVEL, lag=T)
+    space = InflowWindow(coarse_task(tuple(THETA)), coarse_prior("linear"), LEVEL, lag=T)
     return Filter(space), [window_law(space)] * T
 
 
@@ -131,7 +130,6 @@ def measured(filter_, models, m=3, noise=(0.1, 1.0), root=False):
 
 
 def assert_state(filter_, expected, tolerance=1e-9):
-    """Compare mean and variances of the full state."""
     assert_close(filter_.mean, expected.mean, tolerance)
     assert_close(filter_.covariance.diagonal(), expected.variance, tolerance)
 
@@ -317,7 +315,7 @@ def test_several_blocks_of_a_dense_covariance():
 
 def test_windows_with_a_known_velocity_are_the_inflow_window():
     """The difference is at most 1e-3 of the deviation, the truncated part of the response."""
-    task, prior = coarse_task(tuple(THETA)), two_modes(MESH.points[:7], link="linear")
+    task, prior = coarse_task(tuple(THETA)), coarse_prior("linear")
     other = Filter(InflowWindow(task, prior, LEVEL))
     filter_ = Filter(VelocityInflowWindow(task, prior, LEVEL, KNOWN_FLOW, other.space.window_steps))
     seen, _ = measured(other, range(4))

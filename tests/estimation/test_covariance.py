@@ -32,7 +32,6 @@ def open_loop(model):
 
 
 def recursion(model):
-    """Return Π_t by recursion."""
     covariance, result = model.covariance, {}
     for t in range(max(TIMES) + 1):
         result[t] = covariance

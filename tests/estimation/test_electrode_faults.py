@@ -139,12 +139,12 @@ def test_an_episode_does_not_depend_on_the_others(played):
 
 
 def test_without_faults_the_filter_is_the_plain_one() -> None:
-    """Errors in episodes without faults agree within 2 % with the plain filter; the large gate selects the same
+    """Errors in an episode without faults agree within 2 % with the plain filter; the large gate selects the same
     robust fit of c_ref."""
     intact = replace(WORLD, instrument=replace(
         WORLD.instrument, n_dead_range=(0, 0), n_failing_range=(0, 0), n_loose_range=(0, 1)))
     seeds = [seed for seed in range(1, 40)
-             if (instrument_faults(intact, seed).noise_factor == 1.0).all()][:2]
+             if (instrument_faults(intact, seed).noise_factor == 1.0).all()][:1]
     estimated = play(Rules(intact, inflow="learned", faults="estimated"), seeds)[1]
     plain = play(Rules(intact, gate=1e9, inflow="learned"), seeds)[1]
     np.testing.assert_allclose(np.nanmean(estimated, axis=0), np.nanmean(plain, axis=0), rtol=0.02)

@@ -9,33 +9,22 @@ from eitbench.estimation import (
     EnsembleFilter,
     Filter,
     InflowWindow,
-    LinearMeasurement,
     inflow_response,
     linearise_at_prediction,
 )
 from eitbench.worlds.task import make_task
-from models import MESH, averages, coarse_task, coarse_transport, flow_prior, two_modes
+from models import MESH, averaged, coarse_prior, coarse_task, coarse_transport, flow_prior
 from models import textbook_update as textbook
 
-from tiny_worlds import TINY
+from short import TINY
 
 LEVEL = 29.0
 
 
-def prior(link):
-    return two_modes(MESH.points[:7], link=link)
-
-
 def ensemble(link="logarithm", members=40, std=0.5, spin_up_steps=24):
     flow = flow_prior([4.5], [std], [0.1 * std])
-    return EnsembleFilter(coarse_task(), prior(link), LEVEL, flow, members, spin_up_steps,
+    return EnsembleFilter(coarse_task(), coarse_prior(link), LEVEL, flow, members, spin_up_steps,
                           np.random.default_rng(0), linearise_at_prediction(coarse_task()))
-
-
-def observation(seed=5, m=6, variance=0.1):
-    random = np.random.default_rng(seed)
-    H = averages(MESH, random, m)
-    return LinearMeasurement(H, LEVEL + 3.0 * random.normal(size=m), np.full(m, variance))
 
 
 def together(filter_):
@@ -49,7 +38,7 @@ def test_a_measurement_is_the_kalman_update_of_the_members_moments():
     filter_ = ensemble()
     filter_.predict()
     before = together(filter_)
-    seen = observation()
+    seen = averaged(np.random.default_rng(5), 6)
     filter_.update(seen)
     estimate = filter_.estimate()
     innovation, covariance = estimate.innovation, estimate.innovation_covariance
@@ -84,11 +73,11 @@ def test_many_members_give_the_kalman_filter(monkeypatch):
     of its change, and variances to 15 %, five standard errors of 2,000 members."""
     monkeypatch.setattr(inflow_response, "DECAY_TOLERANCE", 1e-6)
     filter_ = ensemble("linear", 2000, std=0.0, spin_up_steps=60)
-    exact = Filter(InflowWindow(coarse_task(), prior("linear"), LEVEL))
+    exact = Filter(InflowWindow(coarse_task(), coarse_prior("linear"), LEVEL))
     for seed in range(4):
         for each in (filter_, exact):
             each.predict()
-        seen = observation(seed, m=2, variance=1.0)
+        seen = averaged(np.random.default_rng(seed), 2, variance=1.0)
         filter_.update(seen)
         exact.update(seen)
     ours, theirs = filter_.estimate(), exact.estimate()
@@ -101,5 +90,5 @@ def test_invalid_arguments_are_rejected():
     with pytest.raises(ValueError, match="members must be"):
         ensemble(members=1)
     with pytest.raises(ValueError, match="the prior must be for the task's inlet"):
-        EnsembleFilter(make_task(TINY), prior("linear"), LEVEL, ensemble().flow, 10, 2, np.random.default_rng(0),
+        EnsembleFilter(make_task(TINY), coarse_prior("linear"), LEVEL, ensemble().flow, 10, 2, np.random.default_rng(0),
                        linearise_at_prediction(coarse_task()))

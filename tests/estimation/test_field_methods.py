@@ -22,7 +22,7 @@ from eitbench.worlds.catalogue import PIPE_2D
 from models import tiny_prior, tiny_task
 from test_gauss_newton import Linear, small_tank
 
-from tiny_worlds import TINY
+from short import TINY
 
 
 @pytest.mark.parametrize("power", [0.0, 0.5, 1.0])
@@ -166,7 +166,6 @@ def test_ensemble_smoother_has_the_most_probable_inflow():
 
 
 def image(method, task, voltages):
-    """Return the image of a frame."""
     estimator = load_method(method, "estimation").make(task)
     for V, I in zip(voltages, task.currents, strict=True):
         estimate = estimator.update(V, I)

@@ -113,7 +113,6 @@ def test_steps_that_overshoot_are_halved():
 
 
 def quadratic():
-    """Return a quadratic model of six states."""
     return 6, QuadraticModel(np.random.default_rng(2))
 
 

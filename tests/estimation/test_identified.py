@@ -28,7 +28,7 @@ from models import by_window
 from models import tiny_prior as prior
 from models import tiny_task as task
 
-from tiny_worlds import TINY
+from short import TINY
 
 LEVEL = 29.0
 

@@ -23,7 +23,7 @@ from models import tiny_prior as prior
 from models import tiny_task as task
 from scipy.linalg import toeplitz
 
-from tiny_worlds import TINY
+from short import TINY
 
 LEVEL = 29.0
 
@@ -39,7 +39,6 @@ def window(link="logarithm", lag=0, law=None):
 
 
 def some_inflows(space):
-    """Return a mean with random inflows."""
     return 0.5 * np.random.default_rng(1).standard_normal(2 * space.window_steps)
 
 
@@ -140,7 +139,6 @@ def test_fits_the_law_of_the_samples():
 
 
 def test_correlation_is_positive_semidefinite():
-    """The covariance in time has no negative eigenvalue for any sample."""
     random = np.random.default_rng(6)
     for _ in range(20):
         ratios = np.exp(0.1 * random.standard_normal((2, 30, 3)).cumsum(axis=1))

@@ -60,7 +60,6 @@ def test_batch_equals_the_textbook(world):
 
 
 def test_results_do_not_depend_on_the_batch(world):
-    """Results of a sequence are bit-identical alone and in a batch."""
     model, records = world
     together, alone = run(started(model, 3), records), run(started(model, 1), records[1:2])
     for ours, theirs in zip(together, alone, strict=True):

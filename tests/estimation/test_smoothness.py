@@ -17,7 +17,6 @@ LENGTH, STD = 0.1, 2.0
 
 
 def node_at(mesh, x, y):
-    """Return the index of the node closest to (x, y)."""
     return int(np.hypot(*(mesh.points - np.array([x, y])).T).argmin())
 
 
@@ -57,7 +56,6 @@ def test_field_is_a_matern_field_mirrored_at_the_walls():
     ("far", 1.0, "length must be a number in m"), (0.1, 0.0, "std must be"),
 ])
 def test_errors_name_the_argument(length, std, message):
-    """Length and standard deviation must be positive."""
     with pytest.raises(ValueError, match=message):
         smoothness_covariance(uniform_disc(0.14, 2), length, std)
 

@@ -106,7 +106,6 @@ def test_close_to_enumeration_where_regimes_change():
 
 
 def test_innovations_are_those_of_the_mixture():
-    """The innovation is the mixture over both regimes, to 1e-9."""
     filter_ = switching(0.1, 0.2)
     first, second = observations(2)
     filtered(filter_, [first])
@@ -190,7 +189,6 @@ def test_resampling_is_unbiased():
 
 @pytest.mark.parametrize("make", [switching, particles], ids=["mixed", "particles"])
 def test_missing_measurements_are_ignored(make):
-    """NaN measurements have no effect."""
     lost, fewer = make(0.1, 0.2), make(0.1, 0.2)
     keep = np.array([True, False, True, True])
     for seen in observations(3):

@@ -42,7 +42,7 @@ def installed(tmp_path_factory):
     def run(*arguments, code=0, cwd=folder):
         done = subprocess.run(
             [python, *arguments], cwd=cwd, capture_output=True, text=True, check=False,
-            env=os.environ | {"EITBENCH_CACHE": str(folder / "cache"), "OPENBLAS_NUM_THREADS": "1", "PYTHONPATH": ""})
+            env=os.environ | {"EITBENCH_CACHE": str(folder / "cache"), "PYTHONPATH": ""})
         assert done.returncode == code, done.stdout + done.stderr
         return done.stdout if code == 0 else done.stderr
 

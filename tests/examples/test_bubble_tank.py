@@ -5,9 +5,9 @@ import json
 
 import numpy as np
 import pytest
-from eitbench.bench.isolation import bubblewrap_problem
 
-ISOLATION = "process" if bubblewrap_problem() else "bubblewrap"
+from tiny import ISOLATION
+
 ID = "bubbles/BubbleTank-v0"
 INJECTION = "bubbles/BubbleTankInjection-v0"
 
@@ -34,7 +34,7 @@ def test_method_and_score_make_a_record_and_a_board(installed):
     methods = ("homogeneous", "bubble_tracker", "gauss_newton")
     installed.commands([
         (["list"], ID), (["list"], INJECTION),
-        *((["submit", "--baseline", method, "--env", ID, "--seeds", "test:0-1", "--to", records, "--jobs", 1], method)
+        *((["submit", "--baseline", method, "--env", ID, "--seeds", "test:0", "--to", records, "--jobs", 1], method)
           for method in methods),
         (["leaderboard", "--records", records], "wrote"),
         (["compare", "bubble_tracker", "gauss_newton", "--records", records, "--score", "bubble_distance"],

@@ -1,4 +1,4 @@
-"""PPO and conservative Q-learning in one file each: formulas, a bandit, a short environment."""
+"""PPO, conservative Q-learning and active perception in one file each: formulas, a bandit, a short environment."""
 
 import importlib.util
 from pathlib import Path
@@ -9,14 +9,13 @@ import pytest
 import torch
 from eitbench.bench.minari_export import export_minari
 
-from short import shorten
+from short import SHORT, shorten
 
 ID = "eitbench/TankTracking-v0"
 PAIRS = np.array([[0, 1], [0, 2], [1, 2]])
 
 
 def example(name):
-    """Import a file of the folder ``examples``."""
     path = Path(__file__).parents[2] / "examples" / f"{name}.py"
     spec = importlib.util.spec_from_file_location(f"{name}_example", path)
     module = importlib.util.module_from_spec(spec)
@@ -115,3 +114,23 @@ def test_q_learning_runs_on_a_minari_set(monkeypatch, tmp_path):
     agent = offline.train(env.unwrapped.rules.pairs, data, 20)
     found = [offline.mean_return(env, agent, [0, 1]) for _ in range(2)]
     assert found[0] == found[1] and np.isfinite(found[0])
+
+
+def test_the_true_image_has_no_loss():
+    """A prediction of the target is free, another one costs its mean squared error; episodes repeat. The environment
+    needs ap_gym, which is not among the dependencies of the tests: `pip install ap_gym`."""
+    ap_gym = pytest.importorskip("ap_gym")
+    module = example("active_perception")
+    env = module.ActiveInjection(ID, world=SHORT["TankTracking"])
+    assert isinstance(env, ap_gym.BaseActivePerceptionEnv) and env.action_space.contains(env.action_space.sample())
+    observation, info = env.reset(seed=3)
+    assert env.observation_space.contains(observation)
+    first = target = info["prediction"]["target"]
+    boxes = target.reshape(6, 6)[1:5, 1:5]
+    assert boxes.min() < -0.01 and np.isfinite(target).all()               # the body is less conductive
+    for off in (0.0, 0.06):
+        _, reward, *_, info = env.step({"action": 5, "prediction": target + np.float32(off)})
+        assert reward == pytest.approx(-(off / module.TARGET_STD)**2, abs=1e-5)
+        np.testing.assert_array_equal(info["prediction"]["target"], target)
+        target = env._target()
+    np.testing.assert_array_equal(env.reset(seed=3)[1]["prediction"]["target"], first)

@@ -1,8 +1,13 @@
-"""Measured cases: environment ids, records and a leaderboard of data that users download."""
+"""Measured cases: environment ids, records and a leaderboard of data that users download, here from a server on this
+machine."""
 
 import json
 import shutil
+import zipfile
 from datetime import date
+from functools import partial
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
+from threading import Thread
 
 import gymnasium as gym
 import numpy as np
@@ -12,7 +17,7 @@ from eitbench.bench import tracks
 from eitbench.bench.records import read_record, read_records, with_content_hash, write_record
 from eitbench.bench.runner import run_on_measurements
 from eitbench.envs.measured import case_env
-from eitbench.measured.cases import CASES, file_sha256, read_case
+from eitbench.measured.cases import CASES, download_case, file_sha256, read_case
 from eitbench.measured.segmentation import ktc_score
 from eitbench.report.site.measured import MeasuredBoards
 from scipy.io import savemat
@@ -109,19 +114,6 @@ def test_unknown_and_incomplete_cases_are_named(tmp_path):
         read_case(tmp_path / "a.yml")
 
 
-def test_run_shows_the_withheld_rmse(folder):
-    """The table has the withheld RMSE instead of ẽ_c."""
-    code, output, err = eitbench("run", "--env", ID, "--baseline", "homogeneous", "--seeds", "test:0-1", "--jobs", 1,
-                                 "--out", folder / "out")
-    assert code == 0, err
-    head, _, row = (line for line in output.splitlines() if line.startswith("|"))
-    (path,) = (folder / "out" / "records").glob("*.json")
-    rmse = [episode["scores"]["prediction_error"] for episode in read_record(path)["episodes"]]
-    shown = row.split("|")[[cell.strip() for cell in head.split("|")].index("withheld RMSE")]
-    assert float(shown.split("±")[0]) == pytest.approx(np.mean(rmse), rel=0.1)
-    assert "ẽ_c" not in head
-
-
 @pytest.fixture(scope="module")
 def submitted(folder):
     """Records of a naive baseline and of a third-party method."""
@@ -135,7 +127,6 @@ def submitted(folder):
 
 @pytest.fixture
 def results(submitted, tmp_path):
-    """Copy of the records that a test may change."""
     return shutil.copytree(submitted, tmp_path / "results")
 
 
@@ -144,15 +135,27 @@ def record_path(results, method):
     return path
 
 
+def test_run_shows_the_withheld_rmse(folder, results):
+    """The table, here of the submitted episodes, has the withheld RMSE instead of ẽ_c."""
+    code, output, err = eitbench("run", "--env", ID, "--baseline", "homogeneous", "--seeds", "test:0-4", "--jobs", 1,
+                                 "--out", folder / "store")
+    assert code == 0 and "5 of 5 episodes are already stored" in output + err, err
+    head, _, row = (line for line in output.splitlines() if line.startswith("|"))
+    episodes = read_record(record_path(results, "homogeneous"))["episodes"]
+    rmse = [episode["scores"]["prediction_error"] for episode in episodes]
+    shown = row.split("|")[[cell.strip() for cell in head.split("|")].index("withheld RMSE")]
+    assert float(shown.split("±")[0]) == pytest.approx(np.mean(rmse), rel=0.1)
+    assert "ẽ_c" not in head
+
+
 def test_submit_writes_records_with_the_scores_of_a_run(results):
     """Five episodes withhold different measurements; `verify` reruns them, and leaderboards of worlds ignore them."""
     written = read_record(record_path(results, "homogeneous"))
     assert written["seeds"] == [f"test:{k}" for k in range(5)]
-    env = gym.make(ID).unwrapped
-    for k, episode in enumerate(written["episodes"][:2]):
-        run = run_on_measurements(env, "homogeneous", k)
-        assert episode["scores"]["prediction_error"] == pytest.approx(run.withheld_rmse, rel=1e-12)
-        assert episode["scores"]["error"] == pytest.approx(run.withheld_rmse**2, rel=1e-12)
+    run = run_on_measurements(gym.make(ID).unwrapped, "homogeneous", 1)
+    scores = written["episodes"][1]["scores"]
+    assert scores["prediction_error"] == pytest.approx(run.withheld_rmse, rel=1e-12)
+    assert scores["error"] == pytest.approx(run.withheld_rmse**2, rel=1e-12)
     assert written["role"] == "floor"
     assert not written["official"]
     assert read_records(results) == []
@@ -248,3 +251,73 @@ def test_inclusions_are_located_as_in_photographs(name):
         labels, _ = label(sign * field > 0.5 * (sign * field)[near].max())
         row, column = center_of_mass(labels == np.bincount(labels[near & (labels > 0)]).argmax())
         assert np.linalg.norm(-0.14 + 0.002 * np.array([column, row]) - [x_true, y_true]) < 0.01
+
+
+@pytest.fixture
+def server(tmp_path, monkeypatch):
+    """Folder that a server offers, and its address; the user's folder of measurements is empty."""
+    offered = tmp_path / "offered"
+    for name, content in {"sub/a.mat": b"data", "sub/ref.mat": b"reference", "frames/1.eit": b"one",
+                          "frames/2.eit": b"two", "other/1.eit": b"not wanted"}.items():
+        path = offered / "repository-abc" / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(content)
+    with zipfile.ZipFile(offered / "archive.zip", "w") as archive:
+        for path in sorted(offered.rglob("*.*t")):
+            archive.write(path, path.relative_to(offered))
+    monkeypatch.setenv("EITBENCH_MEASURED", str(tmp_path / "measured"))
+    handler = partial(SimpleHTTPRequestHandler, directory=offered)
+    with ThreadingHTTPServer(("127.0.0.1", 0), handler) as running:
+        thread = Thread(target=running.serve_forever)
+        thread.start()
+        yield offered / "repository-abc", f"http://127.0.0.1:{running.server_port}"
+        running.shutdown()
+        thread.join()
+
+
+def offer_case(offered, address, file="sub/a.mat", **changes):
+    return write_case(offered.parent / "mine.yml", offered / file, file=file, address=address, source="s", **changes)
+
+
+@pytest.mark.parametrize("place", ["archive.zip", "repository-abc/sub/"])
+def test_missing_files_are_downloaded(server, tmp_path, place):
+    """Archives and folders of single files; the command prints the paths, and a second one downloads nothing."""
+    offered, address = server
+    path = offer_case(offered, f"{address}/{place}",
+                      auxiliary_files={"ref.mat": file_sha256(offered / "sub" / "ref.mat")})
+    code, out, _ = eitbench("fetch", path)
+    found = tmp_path / "measured" / "sub"
+    assert code == 0 and f"wrote {found / 'a.mat'}" in out
+    assert (found / "a.mat").read_bytes() == b"data" and (found / "ref.mat").read_bytes() == b"reference"
+    assert download_case(read_case(path)) == []
+    assert [each.name for each in found.parent.iterdir()] == ["sub"]
+
+
+def test_a_folder_is_extracted_without_others(server, tmp_path):
+    offered, address = server
+    (found,) = download_case(read_case(offer_case(offered, f"{address}/archive.zip", "frames")))
+    assert sorted(each.name for each in found.iterdir()) == ["1.eit", "2.eit"]
+    assert [each.name for each in (tmp_path / "measured").iterdir()] == ["frames"]
+
+
+def test_nothing_is_kept_of_a_wrong_download(server, tmp_path):
+    """Another sha256, a missing file, a file instead of an archive, an unreachable server, a case without address."""
+    offered, address = server
+    folder = f"{address}/repository-abc/sub/"
+    for given, changes, message in [
+            (folder, {"auxiliary_files": {"ref.mat": "0" * 64}}, r"ref\.mat must have the sha256 0000"),
+            (folder, {"auxiliary_files": {"no.mat": "0" * 64}}, "could not be downloaded from .*404"),
+            (f"{address}/archive.zip", {"auxiliary_files": {"no.mat": "0" * 64}}, r"no\.mat must .* got nothing"),
+            (f"{address}/repository-abc/sub/a.mat", {}, "could not be downloaded from .*zip"),
+            ("http://127.0.0.1:9/", {}, "could not be downloaded"), ("", {}, "has no address: save .*a.mat of s in")]:
+        with pytest.raises(ValueError, match=message):
+            download_case(read_case(offer_case(offered, given, **changes)))
+        assert not (tmp_path / "measured").exists() or not [*(tmp_path / "measured").iterdir()]
+
+
+def test_built_in_addresses_name_a_commit():
+    """A branch would change; the sha256 of each file is in the case."""
+    addresses = {path.stem: read_case(path.stem).address for path in CASES.glob("*.yml")}
+    assert sum(map(bool, addresses.values())) == 9
+    for name, address in addresses.items():
+        assert not address or any(len(part) == 40 for part in address.split("/")), name

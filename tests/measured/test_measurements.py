@@ -29,7 +29,6 @@ def small(**changes):
     ({"voltages": np.ones((3, 2))}, r"voltages must have shape \(any, 3\), got \(3, 2\)"),
     ({"voltages": np.full((3, 3), np.nan)}, "voltages must hold numbers, got NaN only"),
     ({"voltages": np.ones((3, 3)) * 1j}, "voltages must be an array of numbers in V, got ndarray of complex128"),
-    ({"voltages": np.full((3, 3), b"a")}, "voltages must be an array of numbers in V, got"),
     ({"voltages": np.full((3, 3), np.inf)}, "voltages must be finite or NaN"),
     ({"voltages": np.ones((0, 3))}, "voltages must hold numbers"),
     ({"injection_index": np.array([0, 1, 2])}, "injection_index must be from 0 to 1, got 0 to 2"),

@@ -54,7 +54,6 @@ def test_derivative_of_the_law(law):
     (lambda: VoltageNoise(relative_to_max=np.inf), "relative_to_max"),
     (lambda: VoltageNoise(floor="low"), "floor")])
 def test_wrong_parameters_are_refused(make, match):
-    """The message names the parameter."""
     with pytest.raises(ValueError, match=f"^{match} must be"):
         make()
 

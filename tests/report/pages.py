@@ -32,7 +32,6 @@ class Page(HTMLParser):
         self.text.append(data)
 
     def attributes(self, name):
-        """Return all values of an attribute."""
         return [attributes[name] for _, attributes in self.tags if name in attributes]
 
 

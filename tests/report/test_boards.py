@@ -16,8 +16,7 @@ from eitbench.report.boards import ALL, record_category
 from eitbench.report.site import collect, render
 from eitbench.report.tables import BADGES
 
-from tables import boards
-from tiny import BOARD_IDS, RUN, record, sha
+from tiny import BOARD_IDS, RUN, boards, record, sha
 
 ROOT = Path(__file__).parents[2]
 FLOOR = [0.20, 0.24, 0.22, 0.26, 0.18, 0.30, 0.25, 0.21]
@@ -39,7 +38,6 @@ def floor(**changes):
 
 
 def table_of(*records):
-    """Return the rows of a single leaderboard by method."""
     return boards(list(records)).set_index("method")
 
 
@@ -153,7 +151,6 @@ def test_time_in_products_and_memory():
 
 
 def test_only_test_seeds():
-    """Leaderboards contain no dev scores."""
     with pytest.raises(ValueError, match=r"made of test seeds; eitbench-Pipe2D-v0--a--\w+--dev\.json has dev"):
         boards([record("a", {"dev:0": 0.1})])
 

@@ -17,8 +17,7 @@ from eitbench.report.compare import (
     naive_baseline_records,
 )
 
-from tables import boards, said
-from tiny import record, sha
+from tiny import boards, record, said, sha
 
 TANK = "eitbench/RotatingTank2D-v0"
 PIPE = "eitbench/Pipe2D-v0"
@@ -108,7 +107,6 @@ def test_only_shared_episodes_count():
 
 
 def test_what_cannot_be_compared():
-    """Methods in different environments or seeds cannot be compared."""
     a = [record("a", [0.1])]
     for b in ([record("b", [0.1], id=TANK)], [record("b", {"test:9": 0.1})], [record("b", {"dev:0": 0.1})],
               [record("b", [None])]):
@@ -120,7 +118,7 @@ def test_records_are_found_by_name_version_and_file(tmp_path, monkeypatch):
     """A name is sufficient if it has one version."""
     monkeypatch.setattr(comparison, "BUNDLED_RECORDS", tmp_path)
     a, (b, _) = two_methods()
-    paths = [write_record(tmp_path, each) for each in [*a, b]]
+    paths = [write_record(tmp_path, each) for each in [*a, b, record("homogeneous", [0.1])]]
     assert find_records("a", tmp_path) == a and find_records(f"a@{sha('a1')[:8]}", tmp_path) == a
     assert find_records(str(paths[2]), tmp_path / "nowhere") == [b]
     write_record(tmp_path, newer := record("a", [0.1], version="2"))
@@ -133,8 +131,8 @@ def test_records_are_found_by_name_version_and_file(tmp_path, monkeypatch):
     for i, each in enumerate(ours):
         write_record(tmp_path, each)
         assert find_records("c@v1", tmp_path) == ours[:1] and find_records("c", tmp_path) == [ours[i]]
-    for nobody in ("d", "c@v"):
-        with pytest.raises(ValueError, match=f"record of {nobody} "):
+    for nobody, message in (("d", ""), ("c@v", ""), ("homogeneus", r".* Did you mean homogeneous\?")):
+        with pytest.raises(ValueError, match=f"record of {nobody} {message}"):
             find_records(nobody, tmp_path)
 
 

@@ -12,8 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
 
-from tables import said
-from tiny import BOARD_IDS, record
+from tiny import BOARD_IDS, record, said
 
 FLOOR, REFERENCE = [0.020, 0.024, 0.022], [0.004, 0.002, 0.003]
 
@@ -29,7 +28,6 @@ ANCHORS = [made("homogeneous", "smoothing", FLOOR), made("true_model_smoother", 
 
 
 def row(records, method, board):
-    """Return the cells of one method on one leaderboard."""
     return next(row.cells for each in run_leaderboards(records) if each.category == board
                 for row in each.rows if row.cells["method"] == method)
 

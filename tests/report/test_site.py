@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 from eitbench._files import PACKAGE
-from eitbench.bench.records import read_records
 from eitbench.bench.table import MISSING
 from eitbench.bench.text import format_interval, format_number
 from eitbench.bench.tracks import ids
@@ -27,8 +26,7 @@ from eitbench.report.tables import BADGES, markdown_table, page_table
 from eitbench.report.templates import N_COLOURS, markdown
 from pages import text_of
 
-from tables import said
-from tiny import BOARD_IDS, RUN, record, several_boards
+from tiny import BOARD_IDS, RUN, record, said, several_boards
 
 ROOT = Path(__file__).parents[2]
 BUDGET = "eitbench/Pipe2DInjectionBudget-v0"
@@ -53,18 +51,18 @@ def site(rendered):
     return rendered(several_boards())
 
 
-def test_published_files_are_rendered_from_the_records():
+def test_published_files_are_rendered_from_the_records(published):
     """`eitbench leaderboard --records leaderboards/results` changes nothing; the site has a limited size."""
     folder = ROOT / "leaderboards"
-    found = collect(read_records(folder / "results"), folder)
+    found = collect(published, folder)
     assert not found.measured.errors
     texts = {name: text.encode() for name, text in render(found).items()}
     expected = {f"site/{path}": content for path, content in render_site(found).items()} | texts
-    published = {path.relative_to(folder).as_posix(): path.read_bytes()
-                 for path in [*(folder / "site").rglob("*"), *map(folder.joinpath, texts)] if path.is_file()}
-    differ = sorted(path for path in expected.keys() | published.keys() if expected.get(path) != published.get(path))
+    present = {path.relative_to(folder).as_posix(): path.read_bytes()
+               for path in [*(folder / "site").rglob("*"), *map(folder.joinpath, texts)] if path.is_file()}
+    differ = sorted(path for path in expected.keys() | present.keys() if expected.get(path) != present.get(path))
     assert not differ, f"{differ} out of date: run `eitbench leaderboard --records leaderboards/results`"
-    assert len(published["site/index.html"]) < 1e6 and sum(map(len, published.values())) < 15e6
+    assert len(present["site/index.html"]) < 1e6 and sum(map(len, present.values())) < 15e6
 
 
 def test_the_same_records_give_the_same_bytes(site, rendered):

@@ -201,7 +201,6 @@ def test_imitation_learns_the_teachers_actions(tmp_path):
     ("total_steps: -1\n", "total_steps must"), ("total_steps: 1\nreward_scale: 0\n", "reward_scale must"),
 ])
 def test_invalid_configurations_are_reported(text, message, tmp_path):
-    """A wrong file is reported before the training starts."""
     path = tmp_path / "config.yml"
     path.write_text(text)
     with pytest.raises(ValueError, match=message):

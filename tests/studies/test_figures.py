@@ -38,7 +38,6 @@ KINDS = {"unknown": "Unknown", "time-varying": "TimeVarying", "skewed": "Skewed"
 
 
 def make_environment(name, world, **kwargs):
-    """Return an environment with a changed world."""
     return EstimationEnv(f"eitbench/{name}-v0", world=world, **kwargs)
 
 
@@ -173,6 +172,5 @@ def test_injection_is_drawn(monkeypatch, run_cache, tmp_path):
 
 
 def test_thesis_figures_show_dev_episodes_by_default(monkeypatch, tmp_path):
-    """Test episodes are never drawn by default."""
     monkeypatch.setattr(pipe2d, "fig5_4", lambda seeds, jobs, out: (out, " ".join(map(format_seed, seeds))))
     assert FIGURES["fig5.4"](None, 1, tmp_path)[1] == "dev:0 dev:1"

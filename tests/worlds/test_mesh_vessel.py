@@ -10,7 +10,7 @@ import cloudpickle
 import gymnasium as gym
 import numpy as np
 import pytest
-from eitbench.bench.isolation import Worker, bubblewrap_problem
+from eitbench.bench.isolation import Worker
 from eitbench.numerics.round_meshes import electrode_disc
 from eitbench.physics.cem import CompleteElectrodeModel
 from eitbench.worlds import World, register
@@ -21,7 +21,7 @@ from eitbench.worlds.vessels import MeshVessel, RoundTank
 
 from shapes import write_mesh
 from short import register_apart
-from tiny import write_baseline
+from tiny import ISOLATION, write_baseline
 
 TANK = RoundTank(n_electrodes=8)
 
@@ -65,7 +65,6 @@ def test_electrodes_are_those_of_the_groups(files, vessel):
 
 @pytest.mark.parametrize("name", ["electrode_{}", "Electrode {}", "electrode-{}", "electrode{}"])
 def test_electrodes_may_count_from_one(name, files, vessel, tmp_path):
-    """Other spellings of the groups give the same model."""
     mesh = files["coarse"][2]
     path = tmp_path / "named.msh"
     write_mesh(path, mesh, {name.format(l + 1): facets for l, facets in enumerate(TANK.electrodes(mesh))})
@@ -90,8 +89,7 @@ def test_a_world_with_it_runs(files, vessel, monkeypatch, tmp_path):
     rewards = [env.step(level)[1] for _ in range(4)]
     assert all(-5.0 < reward < 0.0 for reward in rewards)
     cloudpickle.register_pickle_by_value(sys.modules[__name__])
-    kind = "process" if bubblewrap_problem() else "bubblewrap"
-    with closing(Worker("estimation", "test/Meshed-v0", {}, write_baseline(tmp_path), kind)) as worker:
+    with closing(Worker("estimation", "test/Meshed-v0", {}, write_baseline(tmp_path), ISOLATION)) as worker:
         assert worker(None).update(np.zeros(8), np.zeros(8)).mean.shape == level.shape
     gym.registry.pop("test/Meshed-v0")
 

@@ -8,8 +8,7 @@ from eitbench.worlds.catalogue import PIPE_2D_BIASED, PIPE_2D_SKEWED, PIPE_2D_TI
 from eitbench.worlds.random_streams import episode_streams
 from scipy.stats import kstest
 
-from short import DRAWN, FAST, merged
-from tiny_worlds import TINY, truths
+from short import DRAWN, FAST, TINY, merged, truths
 
 WORLDS = (PIPE_2D_BIASED, PIPE_2D_UNKNOWN, PIPE_2D_TIME_VARYING, PIPE_2D_SKEWED)
 each_world = pytest.mark.parametrize("world", WORLDS, ids=lambda world: world.name)
@@ -17,7 +16,6 @@ each_unknown = pytest.mark.parametrize("world", WORLDS[1:], ids=lambda world: wo
 
 
 def drawn(world, seed):
-    """Return the flow of an episode."""
     return world.flow.draw(world, episode_streams(seed).flow)
 
 

@@ -40,7 +40,6 @@ register(World("Theirs", PlanePipe(length=0.3), LaminarFlow(), Slugs()), "theirs
 
 @pytest.fixture(autouse=True)
 def restored(monkeypatch):
-    """Undo registrations after a test."""
     register_apart(monkeypatch)
     before = set(gym.registry)
     yield
@@ -49,7 +48,6 @@ def restored(monkeypatch):
 
 
 def hands() -> list[str]:
-    """Ids registered by a script."""
     return [each.id for each in registry.runtime_entries()]
 
 

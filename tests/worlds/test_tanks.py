@@ -13,7 +13,7 @@ from eitbench.worlds.vessels import RoundTank
 from scipy.integrate import solve_ivp
 from scipy.stats import kstest
 
-from tiny_worlds import truths
+from short import truths
 
 SHORT = ROTATING.with_changes({"schedule": {"warm_up": 1, "scored_steps": 3}, "vessel": {"n_electrodes": 8}})
 """Four injections of the same flow."""
@@ -76,7 +76,6 @@ def test_ball_goes_round_on_an_orbit_of_the_flow():
 
 
 def test_ball_begins_within_its_range():
-    """Initial positions are uniform between the two radii and in angle."""
     one_step = ROTATING.with_changes({"schedule": {"warm_up": 0, "scored_steps": 1}})
     ball = one_step.target
     starts = np.array([ball.path(one_step, episode_streams(seed).flow).centres[0] for seed in range(50)])

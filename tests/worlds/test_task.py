@@ -16,13 +16,11 @@ from eitbench.worlds.task import make_task
 from eitbench.worlds.world import World
 
 from injection_envs import play
-from short import FAST, world
-from tiny_worlds import TINY
+from short import FAST, TINY, world
 
 
 @pytest.fixture(autouse=True)
 def cache(tmp_path, monkeypatch):
-    """A separate cache folder for each test."""
     monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path / "cache"))
     return tmp_path / "cache"
 

@@ -13,8 +13,7 @@ from eitbench.worlds.catalogue import PIPE_2D_TURBULENT
 from eitbench.worlds.random_streams import episode_streams
 from skfem.helpers import dot, grad
 
-from short import world
-from tiny_worlds import TINY, truths
+from short import TINY, truths, world
 
 R, MEAN, INTENSITY, SCALE = 0.05, 4.5, 0.1, 0.025
 RMS = INTENSITY * MEAN

@@ -1,6 +1,6 @@
-"""Results of the compiled kernels by scipy and numpy alone: references for tests and benchmarks.
+"""Results of the compiled kernels by scipy and numpy alone.
 
-Only the models around the kernels are code under test.
+`kernels.py` compares speed and results; the tests compare the kernels with dense algebra.
 """
 
 from __future__ import annotations
@@ -11,8 +11,9 @@ from unittest import mock
 import numpy as np
 import scipy.sparse as sp
 import skfem
-from eitbench.physics import cem, transport
 from scipy.sparse.linalg import SuperLU, splu
+
+from eitbench.physics import cem, transport
 
 SYMMETRIC = {"diag_pivot_thresh": 0.0, "options": {"SymmetricMode": True}}
 
@@ -25,14 +26,16 @@ class SuperLUCondensation:
 
     batch = 1
 
-    def __init__(self, pattern: sp.csc_array, n_ports: int, places: np.ndarray | None = None) -> None:
+    def __init__(self, pattern: sp.csc_array, n_ports: int,
+                 places: np.ndarray | None = None) -> None:
         del places                                       # the order affects only the speed
         self.n = pattern.shape[0]
         self.n_ports = n_ports
         inner = pattern[:-n_ports, :-n_ports]
         self._place = np.append(_minimum_degree(inner), np.arange(self.n - n_ports, self.n))
         coo = pattern.tocoo()
-        permuted = sp.csc_array((np.ones(coo.nnz), (self._place[coo.row], self._place[coo.col])), shape=pattern.shape)
+        permuted = sp.csc_array((np.ones(coo.nnz), (self._place[coo.row], self._place[coo.col])),
+                                shape=pattern.shape)
         permuted.sort_indices()
         self._indices = permuted.indices
         self._indptr = permuted.indptr
@@ -138,11 +141,6 @@ def reference_model(*arguments, **options) -> cem.CompleteElectrodeModel:
     assert isinstance(model._system, SuperLUCondensation)
     assert isinstance(model._sensitivity, NumpySensitivity)
     return model
-
-
-def unsymmetrised(model: cem.CompleteElectrodeModel, conductivity: np.ndarray) -> np.ndarray:
-    """Return 𝓡 with the last electrode grounded, (L − 1, L − 1), from the factorisation."""
-    return model._system.port_inverse(model._assemble(conductivity))
 
 
 def reference_flow(*arguments, **options) -> transport.ConvectionDiffusion:
