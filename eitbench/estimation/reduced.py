@@ -118,13 +118,15 @@ class ReducedStates(Protocol):
     def initial(self) -> tuple[np.ndarray, np.ndarray]:
         """Return mean (s,) and covariance (s, s) at t = 0."""
 
+    def step(self, mean: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return the Jacobian of a step at a mean (s,), its noise covariance, (s, s) each, and the
+        mean after it; if `propagate` is inherited, also of means (B, s)."""
+
     def propagate(self, mean: np.ndarray,
                   covariance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return mean (B, s) and covariance (B, s, s) one time step later."""
-
-    def step(self, mean: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return the Jacobian of a step at a mean (s,), its noise covariance, (s, s) each, and the
-        mean after it."""
+        F, noise, after = self.step(mean)
+        return after, F @ covariance @ np.swapaxes(F, -1, -2) + noise
 
     def coordinates(self, mean: np.ndarray) -> np.ndarray:
         """Return the coordinates (B, q) of the concentration."""
@@ -150,15 +152,9 @@ class SteadyStates(ReducedStates):
     def initial(self) -> tuple[np.ndarray, np.ndarray]:
         return np.zeros_like(self.model.initial[0]), self.model.initial
 
-    def propagate(self, mean: np.ndarray,
-                  covariance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        A = self.model.transition
-        moved = A @ covariance @ A.T
-        moved += self.model.noise
-        return matvec(A, mean), moved
-
     def step(self, mean: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        return self.model.transition, self.model.noise, self.model.transition @ mean
+        A = self.model.transition
+        return A, self.model.noise, matvec(A, mean)
 
 
 class ReducedFilter:
@@ -243,24 +239,21 @@ class TransitionSplines:
     """A(θ) and the covariance of w between the velocities of a model, by cubic splines."""
 
     def __init__(self, model: JointModel) -> None:
-        self.velocities = model.velocities
-        self._transition = self._coefficients(model.transition)
-        self._noise = self._coefficients(model.noise)
-
-    def _coefficients(self, table: np.ndarray) -> np.ndarray:
-        """Return the coefficients (K − 1, 4, r, r) of (θ − θ_k)³ … 1."""
         from scipy.interpolate import CubicSpline  # lazy import: takes half a second
-        coefficients = np.moveaxis(CubicSpline(self.velocities, table).c, 0, 1)
-        return np.ascontiguousarray(coefficients.astype(table.dtype))
+        self.velocities = model.velocities
+        tables = np.stack([model.transition, model.noise], axis=1)
+        self._coefficients = np.moveaxis(CubicSpline(self.velocities, tables).c.astype(
+            tables.dtype), [0, 2], [1, 0]).copy()
+        """(2, 4, K − 1, r, r) of A and of the covariance, for (θ − θ_k)³ … 1"""
 
     def evaluate(self, velocity: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return A(θ), dA/dθ and cov(w), (B, r, r) each; θ (B,) in m/s is clipped to the table."""
+        """Return A(θ), dA/dθ and cov(w), (..., r, r) each; θ (...,) in m/s is clipped to the table.
+        """
         knots = self.velocities
         theta = np.clip(np.asarray(velocity, dtype=float), knots[0], knots[-1])
         part = np.clip(np.searchsorted(knots, theta, side="right") - 1, 0, len(knots) - 2)
-        d = (theta - knots[part]).astype(self._transition.dtype)[:, None, None]
-        c3, c2, c1, c0 = (self._transition[part, k] for k in range(4))
-        n3, n2, n1, n0 = (self._noise[part, k] for k in range(4))
+        d = (theta - knots[part]).astype(self._coefficients.dtype)[..., None, None]
+        (c3, c2, c1, c0), (n3, n2, n1, n0) = self._coefficients[:, :, part]
         slope = (3 * c3 * d + 2 * c2) * d + c1
         return ((c3 * d + c2) * d + c1) * d + c0, slope, ((n3 * d + n2) * d + n1) * d + n0
 
@@ -294,27 +287,17 @@ class JointStates(ReducedStates):
     def initial(self) -> tuple[np.ndarray, np.ndarray]:
         return self._mean, self._covariance
 
-    def propagate(self, mean: np.ndarray,
-                  covariance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        transition, noise, after = self._step(mean)
-        return after, transition @ covariance @ np.swapaxes(transition, 1, 2) + noise
-
     def step(self, mean: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        transition, noise, after = self._step(mean[None])
-        return transition[0], noise[0], after[0]
-
-    def _step(self, mean: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return [[A, (dA/dθ) a], [0, 1]] and the covariance of (w, ω), (B, r + 1, r + 1), and the
-        next mean (A a, θ), (B, r + 1)."""
-        A, slope, W = self.tables.evaluate(mean[:, -1])
-        B, r = mean[:, :-1].shape
-        transition, noise = np.zeros((2, B, r + 1, r + 1), A.dtype)
-        transition[:, :r, :r] = A
-        transition[:, r, r] = 1.0
-        transition[:, :r, r] = matvec(slope, mean[:, :r])
-        noise[:, :r, :r] = W
-        noise[:, r, r] = self._walk_variance
-        return transition, noise, np.append(matvec(A, mean[:, :r]), mean[:, r:], axis=1)
+        A, slope, W = self.tables.evaluate(mean[..., -1])
+        a, theta = mean[..., :-1], mean[..., -1:]
+        r = a.shape[-1]
+        transition, noise = np.zeros((2, *a.shape[:-1], r + 1, r + 1), A.dtype)
+        transition[..., :r, :r] = A
+        transition[..., r, r] = 1.0
+        transition[..., :r, r] = matvec(slope, a)
+        noise[..., :r, :r] = W
+        noise[..., r, r] = self._walk_variance
+        return transition, noise, np.append(matvec(A, a), theta, axis=-1)
 
     def coordinates(self, mean: np.ndarray) -> np.ndarray:
         return mean[:, :-1]
