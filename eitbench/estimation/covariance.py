@@ -6,7 +6,7 @@ from collections.abc import Callable
 from copy import copy
 from functools import cached_property
 from itertools import pairwise
-from typing import Protocol, Self
+from typing import Self
 
 import numpy as np
 from scipy.linalg import blas
@@ -26,39 +26,8 @@ Transition = np.ndarray | Callable[[np.ndarray], np.ndarray]
 """F (n, n), or X (n, k) -> F X."""
 
 
-class Covariance(Protocol):
-    """Covariance P (n, n) of a state in one of several forms.
-
-    `propagate` and `subtract` return the new covariance: the dense form changes in place, the
-    low-rank form is immutable.
-    """
-
-    @property
-    def array(self) -> np.ndarray:
-        """(n, n) P."""
-
-    def times(self, X: np.ndarray) -> np.ndarray:
-        """Return P X for X (k, m), whose rows belong to the first k entries of the state."""
-
-    def propagate(self, transition: Transition | None,
-                  noise: np.ndarray | None = None) -> Self:
-        """Return F P Fᵀ + Q; None: F = I, Q = 0."""
-
-    def subtract(self, root: np.ndarray) -> Self:
-        """Return P − G Gᵀ, with G (n, m)."""
-
-    def copy(self) -> Self:
-        """Return an independent copy."""
-
-    def diagonal(self) -> np.ndarray:
-        """Return the variances (n,)."""
-
-    def variance_of(self, functionals: np.ndarray) -> np.ndarray:
-        """Return the variances (m,) of linear functionals (m, k) of the first k entries."""
-
-
-class DenseCovariance(Covariance):
-    """Covariance stored as a symmetric matrix P (n, n), modified in place.
+class DenseCovariance:
+    """Covariance stored as a symmetric matrix P (n, n); methods modify it in place and return it.
 
     It supports time-varying transitions, F = I and windows. A transition given as a callable is
     faster where F X costs far less than a product of dense matrices, such as solves with a sparse
@@ -69,30 +38,30 @@ class DenseCovariance(Covariance):
     def __init__(self, covariance: np.ndarray) -> None:
         n = len(covariance)
         covariance = _check.array("covariance", covariance, (n, n))
-        self._array = np.ascontiguousarray(0.5 * (covariance + covariance.T))
-
-    @property
-    def array(self) -> np.ndarray:
-        return self._array
+        self.array = np.ascontiguousarray(0.5 * (covariance + covariance.T))
+        """(n, n) P"""
 
     @cached_property
     def _work(self) -> np.ndarray:
-        return np.empty_like(self._array)
+        return np.empty_like(self.array)
 
-    def copy(self) -> Self:
-        return type(self)(self._array)
+    def copy(self) -> DenseCovariance:
+        """Return an independent copy."""
+        return DenseCovariance(self.array)
 
     def times(self, X: np.ndarray) -> np.ndarray:
-        return self._array[:, :len(X)] @ X
+        """Return P X for X (k, m), whose rows belong to the first k entries of the state."""
+        return self.array[:, :len(X)] @ X
 
     def propagate(self, transition: Transition | None, noise: np.ndarray | None = None) -> Self:
+        """Return F P Fᵀ + Q; None: F = I, Q = 0."""
         if callable(transition):
-            self._array[:] = transition(transition(self._array).T)         # F (F P)ᵀ
-            _mirror(self._array)
+            self.array[:] = transition(transition(self.array).T)           # F (F P)ᵀ
+            _mirror(self.array)
         elif transition is not None:
             self._transform(transition)
         if noise is not None:
-            self._array += noise
+            self.array += noise
         return self
 
     def shift(self, weights: np.ndarray, new_variance: np.ndarray) -> Self:
@@ -101,7 +70,7 @@ class DenseCovariance(Covariance):
         Each number is the sum of its past values, weighted by ``weights`` (W, d), and independent
         noise of variance ``new_variance`` (d,); the oldest value is dropped.
         """
-        P = self._array
+        P = self.array
         d = len(new_variance)
         W = len(weights)
         cross = (weights[:, :, None] * P.reshape(W, d, W * d)).sum(axis=0)             # (d, W·d)
@@ -111,25 +80,28 @@ class DenseCovariance(Covariance):
         after[:d, d:] = cross[:, :-d]
         after[d:, :d] = cross[:, :-d].T
         after[:d, :d] = 0.5 * (variance + variance.T) + np.diag(new_variance)
-        self._array = after
+        self.array = after
         return self
 
     def subtract(self, root: np.ndarray) -> Self:
-        self._array -= np.matmul(root, root.T, out=self._work)
-        diagonal = np.einsum("ii->i", self._array)                                      # a view
+        """Return P − G Gᵀ, with G (n, m)."""
+        self.array -= np.matmul(root, root.T, out=self._work)
+        diagonal = np.einsum("ii->i", self.array)                                       # a view
         np.maximum(diagonal, 0.0, out=diagonal)  # rounding may make small variances negative
         return self
 
     def diagonal(self) -> np.ndarray:
-        return self._array.diagonal().copy()
+        """Return the variances (n,)."""
+        return self.array.diagonal().copy()
 
     def variance_of(self, functionals: np.ndarray) -> np.ndarray:
+        """Return the variances (m,) of linear functionals (m, k) of the first k entries."""
         k = functionals.shape[1]
-        return ((functionals @ self._array[:k, :k]) * functionals).sum(axis=1)
+        return ((functionals @ self.array[:k, :k]) * functionals).sum(axis=1)
 
     def _transform(self, F: np.ndarray) -> None:
         """P ← F P Fᵀ by triangles: with P = L + Lᵀ and B = F L, half of B Fᵀ + F Bᵀ is computed."""
-        P, B = self._array, self._work
+        P, B = self.array, self._work
         diagonal = np.einsum("ii->i", P)
         diagonal *= 0.5
         np.copyto(B, F)
@@ -231,9 +203,10 @@ def open_loop_arrays(transition: np.ndarray, noise: np.ndarray,
             "late_factor": late_factor, "late_signs": late_signs}
 
 
-class LowRankCovariance(Covariance):
+class LowRankCovariance:
     """Covariance P_t = s Π_t − Z Zᵀ: few measurements of a large state, without n×n products.
 
+    It is immutable; for the methods see `DenseCovariance`.
     Measurements add columns to Z (n, r), which is propagated by F and truncated to its numerical
     rank, far below n (``docs/methods.md``, 5). F and Q belong to Π_t.
 
@@ -274,10 +247,6 @@ class LowRankCovariance(Covariance):
         free = self.scale * self.open_loop.apply(self.time, X)
         return free - self.assimilated @ (self.assimilated.T @ X)
 
-    def times_noise(self, X: np.ndarray) -> np.ndarray:
-        """Return Q X for X (n,) or (n, k)."""
-        return self.scale * (self.open_loop.noise @ X)
-
     def propagate(self, transition: Transition | None, noise: np.ndarray | None = None) -> Self:
         return self._with(self.time + 1, self.open_loop.transition @ self.assimilated)
 
@@ -293,6 +262,10 @@ class LowRankCovariance(Covariance):
         free = self.scale * self.open_loop.apply(self.time, functionals.T)
         return ((functionals * free.T).sum(axis=1)
                 - ((functionals @ self.assimilated)**2).sum(axis=1))
+
+
+Covariance = DenseCovariance | LowRankCovariance
+"""Covariance of a state; `propagate` and `subtract` return the new one, perhaps the same object."""
 
 
 def truncate_columns(Z: np.ndarray, tolerance: float) -> np.ndarray:

@@ -91,7 +91,7 @@ class NodalStates(StateSpace):
         """Return Q X of the step to ``time``, for X (n,) or (n, k)."""
         covariance = self._initial[1]
         if isinstance(covariance, LowRankCovariance):
-            return covariance.times_noise(X)
+            return covariance.scale * (covariance.open_loop.noise @ X)
         noise = self.motion(time).noise
         return np.zeros_like(X) if noise is None else noise @ X
 
@@ -106,13 +106,13 @@ class NodalStates(StateSpace):
         return moved, covariance.propagate(motion.transition, motion.noise)
 
 
-class LogStates(StateSpace):
+class LogStates(NodalStates):
     """Logarithm of the concentration, c = ĉ_bh exp(E x_1), with x_1 the first entries of a state.
 
     Parameters
     ----------
     states : NodalStates
-        State space of x; the initial mean is replaced by zero.
+        Initial covariance and motion of x, whose initial mean is zero.
     c_ref : float
         ĉ_bh in mol/m³.
     modes : (n, K), optional
@@ -120,17 +120,10 @@ class LogStates(StateSpace):
     """
 
     def __init__(self, states: NodalStates, c_ref: float, modes: np.ndarray | None = None) -> None:
-        self.states = states
+        mean, covariance = states.initial()
+        super().__init__(np.zeros_like(mean), covariance, states.motion)
         self.c_ref = c_ref
         self.modes = modes
-
-    def initial(self) -> tuple[np.ndarray, Covariance]:
-        mean, covariance = self.states.initial()
-        return np.zeros_like(mean), covariance
-
-    def propagate(self, mean: np.ndarray, covariance: Covariance,
-                  time: int) -> tuple[np.ndarray, Covariance]:
-        return self.states.propagate(mean, covariance, time)
 
     def concentration(self, mean: np.ndarray, lag: int = 0) -> np.ndarray:
         E = self.modes
