@@ -15,6 +15,7 @@ from eitbench.estimation import (
     FilterEstimator,
     InflowPrior,
     InflowWindow,
+    Step,
     linearise_at_prediction,
 )
 
@@ -22,32 +23,31 @@ RATE = 0.03
 MAX_EXCESS = 3.0
 
 
-class AdaptiveFilter:
+class AdaptiveFilter(Filter):
     """Filter of an inflow window that changes q after each measurement."""
 
     def __init__(self, task: Task, c_ref: float) -> None:
         points = task.mesh.points[task.transport.inlet]
         white = InflowPrior("linear", points, task.prior.inflow_std * np.eye(len(points)),
                             np.ones(1), task.transport.time_step)
-        self.space = InflowWindow(task, white, c_ref)
-        self.weights, self.variances = self.space.ar_model
+        self.window = InflowWindow(task, white, c_ref)
+        super().__init__(self.window, linearise_at_prediction(task))
+        self.weights, self.variances = self.window.ar_model
         self.log_q = 0.0
-        self.filter = Filter(self.space, linearise_at_prediction(task))
-        self.estimate = self.filter.estimate
-        self.covariance_of = self.filter.covariance_of
 
-    def assimilate(self, voltages: np.ndarray, currents: np.ndarray) -> None:
+    def assimilate(self, voltages: np.ndarray, currents: np.ndarray) -> Step:
         """Predict, condition on voltages (L,) in V for an injection (L,) in A, and change q."""
-        self.space.ar_model = self.weights, np.exp(self.log_q) * self.variances
-        step = self.filter.assimilate(voltages, currents)
+        self.window.ar_model = self.weights, np.exp(self.log_q) * self.variances
+        step = super().assimilate(voltages, currents)
         used = step.accepted
         if not used.any():
-            return
+            return step
         cross = step.cross_covariance[:, used]
         gain = np.linalg.solve(step.innovation_covariance[np.ix_(used, used)], cross.T)
         correction = step.innovation[used] @ gain
         excess = (correction**2).sum() / (gain * cross.T).sum() - 1.0
         self.log_q += RATE * min(excess, MAX_EXCESS)
+        return step
 
 
 class Estimator(FilterEstimator):

@@ -4,12 +4,9 @@ training episodes, of the errors of linearisation, mesh and assumed velocity.
 The inflow's logarithm has a coloured Gaussian prior, also fitted to training episodes.
 """
 
-from eitbench.estimation import Filter, InflowEstimator, inflow_filter
+from eitbench.estimation import InflowEstimator
 
 
 class Estimator(InflowEstimator):
     subtracks = ("filter", "fixed-lag")
     models = "models/linearised"
-
-    def start(self, c_ref: float) -> Filter:
-        return inflow_filter(self.task, self.prior, c_ref, self.task.lag, model=self.model)

@@ -1,11 +1,8 @@
 """Extended Kalman filter of the log-inflow: a Gaussian prior, correlated in time and across
 the inlet, fitted to training episodes; voltages are linearised about each prediction."""
 
-from eitbench.estimation import Filter, InflowEstimator, inflow_filter
+from eitbench.estimation import InflowEstimator
 
 
 class Estimator(InflowEstimator):
     subtracks = ("filter", "fixed-lag")
-
-    def start(self, c_ref: float) -> Filter:
-        return inflow_filter(self.task, self.prior, c_ref, self.task.lag)

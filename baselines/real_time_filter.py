@@ -8,7 +8,7 @@ from dataclasses import replace
 from functools import lru_cache
 
 from eitbench import Task
-from eitbench.estimation import Filter, InflowEstimator, QuadraticVoltageModel, inflow_filter
+from eitbench.estimation import InflowEstimator, QuadraticVoltageModel
 
 
 class Estimator(InflowEstimator):
@@ -17,9 +17,6 @@ class Estimator(InflowEstimator):
 
     def prepare(self, task: Task) -> Task:
         return replace(task, observation=quadratic(task.observation, self.model))
-
-    def start(self, c_ref: float) -> Filter:
-        return inflow_filter(self.task, self.prior, c_ref, model=self.model)
 
 
 @lru_cache(maxsize=2)

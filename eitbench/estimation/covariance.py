@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from copy import copy
 from functools import cached_property
 from itertools import pairwise
@@ -131,30 +131,22 @@ class OpenLoopCovariance:
     ----------
     transition : (n, n)
         F.
-    noise : (n, n)
-        Γ_w.
-    limit : (n, n)
-        Π_∞.
-    factor, signs : (n, r), (r,)
-        U and the diagonal of D at t = 0.
-    late_factor, late_signs : (n, s), (s,)
-        The same at t = `COMPRESSED_FROM`.
+    arrays
+        Result of `open_loop_arrays`.
     """
 
-    def __init__(self, transition: np.ndarray, *, noise: np.ndarray, limit: np.ndarray,
-                 factor: np.ndarray, signs: np.ndarray, late_factor: np.ndarray,
-                 late_signs: np.ndarray) -> None:
+    def __init__(self, transition: np.ndarray, arrays: Mapping[str, np.ndarray]) -> None:
         self.transition = transition
-        self.noise = noise
-        self.limit = limit
-        self._late = late_factor, late_signs
-        self._transients = [(factor, signs)]  # (U, D) at t = 0, 1, …
+        self.noise = arrays["noise"]
+        self.limit = arrays["limit"]
+        self._late = arrays["late_factor"], arrays["late_signs"]
+        self._transients = [(arrays["factor"], arrays["signs"])]  # (U, D) at t = 0, 1, …
 
     @classmethod
     def of(cls, transition: np.ndarray, noise: np.ndarray,
            initial: np.ndarray | None = None) -> Self:
         """Return the covariance with the arguments of `open_loop_arrays`."""
-        return cls(transition, **open_loop_arrays(transition, noise, initial))
+        return cls(transition, open_loop_arrays(transition, noise, initial))
 
     def apply(self, t: int, X: np.ndarray) -> np.ndarray:
         """Return Π_t X for X (n, k)."""
@@ -182,7 +174,8 @@ class OpenLoopCovariance:
 
 def open_loop_arrays(transition: np.ndarray, noise: np.ndarray,
                      initial: np.ndarray | None = None) -> dict[str, np.ndarray]:
-    """Return the arguments of `OpenLoopCovariance` by name, except the first.
+    """Return Γ_w and Π_∞ (n, n), and U (n, r) and the diagonal of D (r,) at t = 0 and at t =
+    `COMPRESSED_FROM`, by name, for `OpenLoopCovariance`.
 
     Parameters
     ----------

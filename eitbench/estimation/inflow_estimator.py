@@ -15,14 +15,16 @@ from eitbench.estimation.correction import (
 from eitbench.estimation.estimators import FilterEstimator
 from eitbench.estimation.identified import IdentifiedModel, compatible_models
 from eitbench.estimation.inflow_prior import InflowPrior, compatible_priors
+from eitbench.estimation.inflow_window import inflow_filter
 from eitbench.worlds.task import Task
 
 
 class InflowEstimator(FilterEstimator):
     """Estimator with a prior of the inflow, and where a subclass names them, a model of the pipe
-    and a network, all fitted to training episodes.
+    and a network, all fitted to training episodes: by default `inflow_filter`.
 
-    Subclasses define `start`, and `suits` if they do not need a specified velocity.
+    Subclasses define `start` for other filters, and `suits` if they do not need a specified
+    velocity.
     """
 
     folder: ClassVar[Path] = bundled_path("baselines")
@@ -47,7 +49,7 @@ class InflowEstimator(FilterEstimator):
 
     def start(self, c_ref: float) -> Any:
         """Return the filter at t = 0 for ĉ_bh in mol/m³."""
-        raise NotImplementedError
+        return inflow_filter(self.task, self.prior, c_ref, self.task.lag, model=self.model)
 
     @classmethod
     def priors(cls, task: Task) -> list[InflowPrior]:

@@ -43,10 +43,8 @@ class Regimes:
     """variance of the inflow in the quiet regime, relative to that in slugs"""
 
     def __post_init__(self) -> None:
-        _check.number("p_onset", self.p_onset, low=0.0, high=1.0, open_low=True)
-        _check.number("p_end", self.p_end, low=0.0, high=1.0, open_low=True)
-        _check.number("quiet_variance_ratio", self.quiet_variance_ratio, low=0.0, high=1.0,
-                      open_low=True)
+        for name, value in vars(self).items():
+            _check.number(name, value, low=0.0, high=1.0, open_low=True)
 
     @property
     def share(self) -> float:

@@ -233,7 +233,7 @@ def _open_loop(transport: Transport, prior: Prior) -> OpenLoopCovariance:
 
     known_by = [array_digest(F, Y, transport.mesh.points), config_dict(prior)]
     key = model_key("open_loop", known_by, OPEN_LOOP_VERSION)
-    return OpenLoopCovariance(F, **cached(key, build, limit=MAX_STORED_OPEN_LOOPS))
+    return OpenLoopCovariance(F, cached(key, build, limit=MAX_STORED_OPEN_LOOPS))
 
 
 @lru_cache(maxsize=4)

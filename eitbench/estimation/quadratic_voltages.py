@@ -3,26 +3,16 @@
 from __future__ import annotations
 
 from functools import lru_cache
-from typing import Protocol
 
 import numpy as np
 
 from eitbench import _check
+from eitbench.physics.observation import ObservationModel
 
 DIFFERENCE_STEP = 0.1
 """Step of the finite differences: root mean square change of the logarithm by a mode."""
 CACHE_BYTES = 2**27
 """Memory for cached arrays per model: in 2D enough for 250 injections, more than all pairs."""
-
-
-class TransferResistanceModel(Protocol):
-    """Model of transfer resistances, such as `ObservationModel`."""
-
-    min_concentration: float
-    """mol/m³, lower bound to which smaller concentrations are raised"""
-
-    def resistance_derivatives(self, concentration: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return transfer resistances (L, L) in Ω (Ω·m in 2D), and derivatives (n, L, L) by c."""
 
 
 class QuadraticVoltageModel:
@@ -34,14 +24,14 @@ class QuadraticVoltageModel:
 
     Parameters
     ----------
-    model : TransferResistanceModel
+    model : ObservationModel
     c_ref : float
         c_0 in mol/m³.
     modes : (n, q)
         Linearly independent modes of u; the remainder of u enters linearly.
     """
 
-    def __init__(self, model: TransferResistanceModel, c_ref: float, modes: np.ndarray) -> None:
+    def __init__(self, model: ObservationModel, c_ref: float, modes: np.ndarray) -> None:
         self.c_ref = _check.number("c_ref", c_ref, low=0.0, open_low=True, units="mol/m³")
         self.smallest = model.min_concentration
         modes = _check.array("modes", modes, (None, None))
@@ -61,12 +51,12 @@ class QuadraticVoltageModel:
         """𝓡_0 (L, L), D (n, L·L), the map (q, n) from u to modes, and H (q, q, L·L)"""
         self._of_injection = lru_cache(maxsize=max(1, injections))(self._contracted)
 
-    def _derivatives(self, model: TransferResistanceModel,
+    def _derivatives(self, model: ObservationModel,
                      c: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the quadratic quantity (L, L) and its derivatives (n, L, L) by c."""
         return model.resistance_derivatives(c)
 
-    def _by_mode(self, model: TransferResistanceModel, modes: np.ndarray,
+    def _by_mode(self, model: ObservationModel, modes: np.ndarray,
                  u: np.ndarray) -> np.ndarray:
         """Return the derivatives (q, L·L) by the modes at ln(c/c_0) = u."""
         c = self.c_ref * np.exp(u)
@@ -115,12 +105,12 @@ class ScaledVoltageModel(QuadraticVoltageModel):
     `QuadraticVoltageModel`; a constant is added to the modes.
     """
 
-    def __init__(self, model: TransferResistanceModel, c_ref: float, modes: np.ndarray) -> None:
+    def __init__(self, model: ObservationModel, c_ref: float, modes: np.ndarray) -> None:
         modes = _check.array("modes", modes, (None, None))
         with_level, _ = np.linalg.qr(np.column_stack([np.ones(len(modes)), modes]))
         super().__init__(model, c_ref, with_level)
 
-    def _derivatives(self, model: TransferResistanceModel,
+    def _derivatives(self, model: ObservationModel,
                      c: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         R, by_c = model.resistance_derivatives(c)
         scale = self._scale(c)

@@ -160,7 +160,6 @@ def scaled_velocity_prior(task: Task, std: float, walk_std: float) -> VelocityPr
     The factor is a random walk with initial mean 1, initial standard deviation ``std``, and
     standard deviation ``walk_std`` per time step. ``ValueError`` if the task has no flow.
     """
-    from eitbench.physics.transport import ConvectionDiffusion
     transport = task.transport
     if not isinstance(transport, ConvectionDiffusion):
         raise ValueError(f"task must have a flow, got {type(transport).__name__}")
@@ -205,18 +204,14 @@ class VelocityInflowWindow(StateSpace):
         self._new_variance[r:] = flow.walk_std**2
         std = np.tile(np.append(np.ones(r), flow.initial_std), W)
         self._covariance = std[:, None] * covariance * std
-        self._initialise_window(W, k)
-
-    def _initialise_window(self, W: int, k: int) -> None:
-        """Initialise the contributions of past inflows at the nominal velocity."""
-        transport = self.flow.transport_at(self.flow.initial)
+        transport = flow.transport_at(flow.initial)
         self._inlet = transport.inlet
         parts = [one_step_response(transport)]
         for _ in range(W - 1):
             parts.append(transport.step(parts[-1], parts[-1][self._inlet], 0.0))
         by_inflow = np.stack(parts, axis=1)
         n = len(by_inflow)
-        self._constant = self.c_ref * (1.0 - by_inflow.sum(axis=(1, 2)))
+        self._constant = c_ref * (1.0 - by_inflow.sum(axis=(1, 2)))
         """(n,) part that depends on neither the last inflows nor the last θ"""
         self._parts = np.concatenate([by_inflow, np.zeros((n, W, k))], axis=2)
         """(n, W, n_inlet + k) contributions of c_in (mol/m³) and θ of each step, per unit"""
@@ -274,10 +269,10 @@ class VelocityInflowWindow(StateSpace):
 
     def velocity(self, mean: np.ndarray,
                  covariance: Covariance) -> tuple[np.ndarray, np.ndarray]:
-        newest = slice(self.n_modes, self._weights.shape[1])
-        return mean[newest].copy(), covariance.diagonal()[newest]
+        return self._theta(mean).copy(), self._theta(covariance.diagonal())
 
     def _theta(self, mean: np.ndarray) -> np.ndarray:
+        """Return the present entries of θ (k,)."""
         return mean[self.n_modes:self._weights.shape[1]]
 
     def _inflows(self, mean: np.ndarray) -> np.ndarray:

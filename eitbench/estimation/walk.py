@@ -115,7 +115,6 @@ class RandomWalk:
 
     def evolution_model(self) -> EvolutionModel:
         """Return F, an empty Y and H, where H Hᵀ is `covariance`."""
-        from eitbench.physics.transport import EvolutionModel
         F, Y = self.transition()
         return EvolutionModel(F, Y, np.linalg.cholesky(self.covariance))
 

@@ -21,8 +21,9 @@ from eitbench.data.seeds import SPLITS
 from eitbench.estimation.inflow_prior import InflowPrior, fit_prior_from_episodes
 from eitbench.estimation.inflow_response import ImpulseResponse, principal_directions
 from eitbench.estimation.inflow_window import yule_walker
-from eitbench.estimation.quadratic_voltages import ScaledVoltageModel, TransferResistanceModel
+from eitbench.estimation.quadratic_voltages import ScaledVoltageModel
 from eitbench.estimation.reduced import ReducedStates, matvec
+from eitbench.physics.observation import ObservationModel
 from eitbench.worlds.world import World
 
 N_RECENT_INFLOWS = 8
@@ -225,7 +226,7 @@ class NodeVoltages(NamedTuple):
         return voltages / scale, (by_u / (relative * scale)[:, None]) @ self.basis
 
 
-def node_voltages(model: TransferResistanceModel, level: float, basis: np.ndarray,
+def node_voltages(model: ObservationModel, level: float, basis: np.ndarray,
                   samples: np.ndarray) -> NodeVoltages:
     """Return the voltages of concentrations level·(1 + basis·y), such as ``samples`` (N, q) of y.
 
