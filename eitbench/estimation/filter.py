@@ -16,13 +16,17 @@ from eitbench.worlds.task import Estimate
 class StateSpace:
     """State x of a filter: its evolution, and the concentration as a function of it.
 
-    Subclasses define the propagation of mean and covariance, and the concentration; the other
+    Subclasses define the state at t = 0 and the propagation of mean and covariance; the other
     methods have defaults for a state that is the concentration itself.
     """
 
+    start: tuple[np.ndarray, Covariance]
+    """Mean and covariance at t = 0; not modified"""
+
     def initial(self) -> tuple[np.ndarray, Covariance]:
-        """Return mean and covariance at t = 0."""
-        raise NotImplementedError
+        """Return copies of mean and covariance at t = 0."""
+        mean, covariance = self.start
+        return mean.copy(), covariance.copy()
 
     def propagate(self, mean: np.ndarray, covariance: Covariance,
                   time: int) -> tuple[np.ndarray, Covariance]:

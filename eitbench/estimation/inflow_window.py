@@ -87,12 +87,10 @@ class InflowWindow(StateSpace):
         """W"""
         self.time = 0
         """t"""
-        weights, variances, self._prior_covariance = window_model(prior, self.window_steps)
+        weights, variances, covariance = window_model(prior, self.window_steps)
+        self.start = np.zeros(len(covariance)), DenseCovariance(covariance)
         self.ar_model = weights, variances
         """weights (W, r) and variances (r,) of the entries of the next x"""
-
-    def initial(self) -> tuple[np.ndarray, Covariance]:
-        return np.zeros(len(self._prior_covariance)), DenseCovariance(self._prior_covariance)
 
     def propagate(self, mean: np.ndarray, covariance: Covariance,
                   time: int) -> tuple[np.ndarray, Covariance]:

@@ -72,7 +72,7 @@ class NodalStates(StateSpace):
 
     def __init__(self, mean: np.ndarray, covariance: Covariance,
                  motion: Motion | Callable[[int], Motion]) -> None:
-        self._initial = mean, covariance
+        self.start = np.array(mean, dtype=float), covariance
         self._motion = motion
 
     def motion(self, time: int) -> Motion:
@@ -83,21 +83,17 @@ class NodalStates(StateSpace):
         """Return F (n, n) of the step to ``time``."""
         F = self.motion(time).transition
         if F is None or callable(F):
-            identity = np.eye(len(self._initial[0]))
+            identity = np.eye(len(self.start[0]))
             return identity if F is None else F(identity)
         return F
 
     def noise_times(self, time: int, X: np.ndarray) -> np.ndarray:
         """Return Q X of the step to ``time``, for X (n,) or (n, k)."""
-        covariance = self._initial[1]
+        covariance = self.start[1]
         if isinstance(covariance, LowRankCovariance):
             return covariance.scale * (covariance.open_loop.noise @ X)
         noise = self.motion(time).noise
         return np.zeros_like(X) if noise is None else noise @ X
-
-    def initial(self) -> tuple[np.ndarray, Covariance]:
-        mean, covariance = self._initial
-        return np.array(mean, dtype=float), covariance.copy()
 
     def propagate(self, mean: np.ndarray, covariance: Covariance,
                   time: int) -> tuple[np.ndarray, Covariance]:
@@ -120,7 +116,7 @@ class LogStates(NodalStates):
     """
 
     def __init__(self, states: NodalStates, c_ref: float, modes: np.ndarray | None = None) -> None:
-        mean, covariance = states.initial()
+        mean, covariance = states.start
         super().__init__(np.zeros_like(mean), covariance, states.motion)
         self.c_ref = c_ref
         self.modes = modes

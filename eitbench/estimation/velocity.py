@@ -102,12 +102,9 @@ class VelocityStates(StateSpace):
         n = self._n = task.mesh.n_nodes
         self._inflow_std = task.prior.inflow_std * c_ref
         self._nodal_noise = c_ref**2 * state_noise(task.transport, task.prior)
-        self._mean = np.concatenate([np.full(n, c_ref), flow.initial])
-        self._covariance = block_diag(c_ref**2 * initial_covariance(task.mesh, task.prior),
-                                      np.diag(flow.initial_std**2))
-
-    def initial(self) -> tuple[np.ndarray, Covariance]:
-        return self._mean.copy(), DenseCovariance(self._covariance)
+        covariance = block_diag(c_ref**2 * initial_covariance(task.mesh, task.prior),
+                                np.diag(flow.initial_std**2))
+        self.start = np.append(np.full(n, c_ref), flow.initial), DenseCovariance(covariance)
 
     def propagate(self, mean: np.ndarray, covariance: Covariance,
                   time: int) -> tuple[np.ndarray, Covariance]:
@@ -125,7 +122,7 @@ class VelocityStates(StateSpace):
             return np.concatenate([moved, X[n:]])
 
         Y = self._inflow_std * one_step_response(transport)
-        noise = np.zeros_like(self._covariance)
+        noise = np.zeros((len(mean), len(mean)))
         noise[:n, :n] = Y @ Y.T + self._nodal_noise
         noise[n:, n:] = np.diag(self.flow.walk_std**2)
         return np.concatenate([after, theta]), covariance.propagate(advance, noise)
@@ -203,7 +200,8 @@ class VelocityInflowWindow(StateSpace):
         self._weights, self._new_variance, covariance = window_model(prior, W, k)
         self._new_variance[r:] = flow.walk_std**2
         std = np.tile(np.append(np.ones(r), flow.initial_std), W)
-        self._covariance = std[:, None] * covariance * std
+        mean = np.tile(np.append(np.zeros(r), flow.initial), W)
+        self.start = mean, DenseCovariance(std[:, None] * covariance * std)
         transport = flow.transport_at(flow.initial)
         self._inlet = transport.inlet
         parts = [one_step_response(transport)]
@@ -215,11 +213,6 @@ class VelocityInflowWindow(StateSpace):
         """(n,) part that depends on neither the last inflows nor the last θ"""
         self._parts = np.concatenate([by_inflow, np.zeros((n, W, k))], axis=2)
         """(n, W, n_inlet + k) contributions of c_in (mol/m³) and θ of each step, per unit"""
-
-    def initial(self) -> tuple[np.ndarray, Covariance]:
-        mean = np.zeros(self._weights.shape)
-        mean[:, self.n_modes:] = self.flow.initial
-        return mean.ravel(), DenseCovariance(self._covariance)
 
     def propagate(self, mean: np.ndarray, covariance: Covariance,
                   time: int) -> tuple[np.ndarray, Covariance]:
