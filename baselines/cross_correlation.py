@@ -18,6 +18,7 @@ from eitbench import Estimate, Task
 from eitbench.estimation import (
     Filter,
     FilterEstimator,
+    Step,
     VelocityStates,
     linearise_at_prediction,
     linearise_at_reference,
@@ -40,11 +41,14 @@ FACTORS = np.linspace(0.4, 1.7, 66)
 """Velocity relative to the prior mean."""
 
 
-class CrossCorrelationFilter:
-    """Filter with a velocity from cross-correlation, for `FilterEstimator`."""
+class CrossCorrelationFilter(Filter):
+    """Filter with a velocity from cross-correlation."""
 
     def __init__(self, task: Task, c_ref: float) -> None:
         flow = task_velocity_prior(task)
+        zero = np.zeros_like(flow.initial)
+        exact = replace(flow, initial_std=zero, walk_std=zero)
+        super().__init__(VelocityStates(task, c_ref, exact), linearise_at_prediction(task))
         self._nominal = self._velocity = flow.initial
         walk = RandomWalk(task.mesh, task.transport.time_step, LENGTH)
         prior = replace(task.prior, nodal_std=STEP, initial_std=INITIAL_STD, initial_length=LENGTH)
@@ -53,12 +57,8 @@ class CrossCorrelationFilter:
         fastest = (flow.profiles @ flow.initial).max() / METER_FACTOR
         self._lags = distance / (FACTORS * fastest * task.transport.time_step)
         self._averages: list[np.ndarray] = []
-        zero = np.zeros_like(flow.initial)
-        exact = replace(flow, initial_std=zero, walk_std=zero)
-        self._filter = Filter(VelocityStates(task, c_ref, exact), linearise_at_prediction(task))
-        self.covariance_of = self._filter.covariance_of
 
-    def assimilate(self, voltages: np.ndarray, currents: np.ndarray) -> None:
+    def assimilate(self, voltages: np.ndarray, currents: np.ndarray) -> Step:
         """Use a measurement vector (L,) in V and its injection (L,) in A (A/m in 2D)."""
         self._images.assimilate(voltages, currents)
         self._averages.append(self._sections @ self._images.mean)
@@ -67,12 +67,12 @@ class CrossCorrelationFilter:
         best = int(np.argmax(correlations))
         if correlations[best] >= MIN_CORRELATION and 0 < best < len(FACTORS) - 1:
             self._velocity = FACTORS[best] * self._nominal
-        self._filter.mean[-len(self._velocity):] = self._velocity
-        self._filter.assimilate(voltages, currents)
+        self.mean[-len(self._velocity):] = self._velocity
+        return super().assimilate(voltages, currents)
 
     def estimate(self, lag: int = 0) -> Estimate:
         """Return the present state."""
-        return self._filter.estimate(lag)._replace(velocity_variance=None)
+        return super().estimate(lag)._replace(velocity_variance=None)
 
 
 def cross_sections(task: Task) -> tuple[np.ndarray, float]:

@@ -18,7 +18,6 @@ from eitbench.estimation import (
     RecordSmoother,
     apply_correction,
     gru_step,
-    initial_hidden_state,
 )
 
 LAG = 20
@@ -50,7 +49,7 @@ class Estimator(InflowEstimator):
 
     def hidden_states(self, inputs: np.ndarray, direction: str) -> Iterator[np.ndarray]:
         """Yield the hidden state (h,) of each step."""
-        state = initial_hidden_state(self.network)
+        state = None
         for each in inputs:
             state = gru_step(self.network, each, state, direction)
             yield state

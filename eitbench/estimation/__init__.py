@@ -7,7 +7,6 @@ from eitbench.estimation.correction import (
     VoltageFeatures,
     apply_correction,
     gru_step,
-    initial_hidden_state,
     load_network,
     network_matches_task,
 )
@@ -99,7 +98,7 @@ __all__ = [
     "apply_correction", "best_homogeneous", "compatible_models", "compatible_priors", "condition",
     "fit_inflow_prior", "fit_prior_from_episodes", "fixed_interval_smoother", "flow_motion",
     "full_window_filter", "gauss_newton", "gru_step", "identify_model", "inflow_filter",
-    "initial_covariance", "initial_hidden_state", "innovate", "kalman_filter",
+    "initial_covariance", "innovate", "kalman_filter",
     "linearise_at_prediction", "linearise_at_reference", "linearise_voltages", "load_network",
     "map_inflow", "maximise_posterior", "modal_states", "nearest_observed", "network_matches_task",
     "nodal_filter", "nodal_states", "one_step", "reduced_response", "scaled_velocity_prior",

@@ -98,14 +98,13 @@ class BodyModel:
         return area * sum(weight * (cem.mesh.interpolation_to(grid + self.radius * point) @ density)
                           for weight, point in zip(DISC_WEIGHTS, DISC_POINTS, strict=True)).T
 
-    def draw(self, random: np.random.Generator, count: int) -> tuple[np.ndarray, ...]:
-        """Draw centres, velocities and areas of bodies at the start, (count, …)."""
-        return self.motion.draw(random, count), *self._draw_rest(random, count)
-
-    def _draw_rest(self, random: np.random.Generator, count: int) -> tuple[np.ndarray, np.ndarray]:
+    def draw(self, random: np.random.Generator, centres: np.ndarray) -> tuple[np.ndarray, ...]:
+        """Draw velocities (count, 2) and areas (count,) of bodies at ``centres`` (count, 2); return
+        all three."""
         motion = self.motion
-        return (motion.mean_velocity + motion.velocity_std * random.standard_normal((count, 2)),
-                np.exp(self.log_area_std * random.standard_normal(count)))
+        normal = random.standard_normal(centres.shape)
+        return (centres, motion.mean_velocity + motion.velocity_std * normal,
+                np.exp(self.log_area_std * random.standard_normal(len(centres))))
 
     def move(self, particles: Particles, weights: np.ndarray,
              random: np.random.Generator) -> tuple[Particles, np.ndarray]:
@@ -125,7 +124,7 @@ class BodyModel:
             ratio = np.where(entering, motion.enter / PROPOSED_ENTRIES,
                              (1.0 - motion.enter) / (1.0 - PROPOSED_ENTRIES))
             weights = normalise(weights * np.where(present, 1.0, ratio).prod(axis=2))
-            new = motion.entries(random, P * K), *self._draw_rest(random, P * K)
+            new = self.draw(random, motion.entries(random, P * K))
             centres, velocities, areas = (
                 np.where(entering.reshape(*entering.shape, *(1,) * (old.ndim - 3)),
                          each.reshape(old.shape[1:]), old)
@@ -141,7 +140,8 @@ class BodyModel:
         P, K = particles.areas.shape[1:]
         jumping = np.arange(random.integers(RESTART_STRIDE), P, RESTART_STRIDE)
         body = np.arange(len(jumping)) % K
-        for old, new in zip(particles, (*self.draw(random, len(jumping)), True), strict=True):
+        drawn = self.draw(random, self.motion.draw(random, len(jumping)))
+        for old, new in zip(particles, (*drawn, True), strict=True):
             old[:, jumping, body] = new
         factor = np.full(P, (1.0 - RESTART_WEIGHT) / (1.0 - 1.0 / RESTART_STRIDE))
         factor[jumping] = RESTART_WEIGHT * RESTART_STRIDE
@@ -191,8 +191,8 @@ class BodyParticleFilter:
         self._random = np.random.default_rng(SEED)
         K = model.target.n_bodies
         P = self.n_particles = n_particles * 4 ** (K - 1)
-        states = (each.reshape(P, K, *each.shape[1:])
-                  for each in model.draw(self._random, P * K))
+        drawn = model.draw(self._random, model.motion.draw(self._random, P * K))
+        states = (each.reshape(P, K, *each.shape[1:]) for each in drawn)
         centres, velocities, areas = (np.repeat(each[None], episodes, axis=0) for each in states)
         self.particles = Particles(centres, velocities, areas, np.full(areas.shape, True))
         self.weights = np.full((episodes, P), 1.0 / P)

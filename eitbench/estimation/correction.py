@@ -41,12 +41,15 @@ def network_matches_task(path: Path, task: Task) -> bool:
 # -- the network -----------------------------------------------------------------------------------
 
 
-def gru_step(network: Network, inputs: np.ndarray, hidden_state: np.ndarray,
+def gru_step(network: Network, inputs: np.ndarray, hidden_state: np.ndarray | None,
              direction: str = "") -> np.ndarray:
     """Return the new hidden state (h,) of a gated recurrent unit (Cho et al. 2014).
 
-    ``inputs`` (d,) are not scaled; ``direction`` is ``"backward_"`` for the backward unit.
+    ``inputs`` (d,) are not scaled; None is the state before the first input; ``direction`` is
+    ``"backward_"`` for the backward unit.
     """
+    if hidden_state is None:
+        hidden_state = np.zeros(network["hidden_weight"].shape[1])
     inputs = inputs / network["input_scale"]
     seen = network[f"{direction}input_weight"] @ inputs + network[f"{direction}input_bias"]
     kept = network[f"{direction}hidden_weight"] @ hidden_state + network[f"{direction}hidden_bias"]
@@ -55,11 +58,6 @@ def gru_step(network: Network, inputs: np.ndarray, hidden_state: np.ndarray,
     reset = _sigmoid(seen_reset + kept_reset)
     keep = _sigmoid(seen_keep + kept_keep)
     return (1.0 - keep) * np.tanh(seen_new + reset * kept_new) + keep * hidden_state
-
-
-def initial_hidden_state(network: Network) -> np.ndarray:
-    """Return the hidden state (h,) before the first input."""
-    return np.zeros(network["hidden_weight"].shape[1])
 
 
 def apply_correction(network: Network, c_ref: float, reduced: np.ndarray, inputs: np.ndarray,
@@ -184,7 +182,7 @@ class NetworkCorrectedFilter:
         self.network = network
         self.features = features
         self.lag = features.task.lag
-        self._hidden_state = initial_hidden_state(network)
+        self._hidden_state: np.ndarray | None = None
         self._measured = 0
 
     def assimilate(self, voltages: np.ndarray, currents: np.ndarray) -> None:
@@ -197,14 +195,14 @@ class NetworkCorrectedFilter:
             reduced = self.features.modes(self.lag)
             inputs = np.concatenate([inputs, reduced])
         self._hidden_state = gru_step(self.network, inputs, self._hidden_state)
-        self._last = reduced, inputs
+        self._last = reduced, inputs, self._hidden_state
 
     def estimate(self, lag: int = 0) -> Estimate:
         """Return the state ``lag`` steps ago."""
         if lag < self.lag:
             assert isinstance(self.features, FilterFeatures)
             return self.features.filter.estimate(lag)
-        return apply_correction(self.network, self.features.c_ref, *self._last, self._hidden_state)
+        return apply_correction(self.network, self.features.c_ref, *self._last)
 
 
 def injection_one_hot(task: Task, currents: np.ndarray) -> np.ndarray:
