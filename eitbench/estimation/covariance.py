@@ -293,8 +293,6 @@ def _threshold(limit: np.ndarray) -> float:
 def _compressed(U: np.ndarray, signs: np.ndarray,
                 threshold: float) -> tuple[np.ndarray, np.ndarray]:
     """Return U and D with fewer columns and the same U D Uᵀ up to ``threshold``."""
-    if not U.shape[1]:
-        return U, signs
     Q, R = np.linalg.qr(U)
     W, signs = _signed_factor((R * signs) @ R.T, threshold)
     return Q @ W, signs

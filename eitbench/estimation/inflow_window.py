@@ -12,7 +12,7 @@ from eitbench.estimation.covariance import Covariance, DenseCovariance
 from eitbench.estimation.estimators import Measurement
 from eitbench.estimation.filter import Filter, StateSpace
 from eitbench.estimation.gauss_newton import gauss_newton
-from eitbench.estimation.gaussian import Forward, linearise_at_prediction
+from eitbench.estimation.gaussian import linearise_at_prediction
 from eitbench.estimation.identified import IdentifiedModel
 from eitbench.estimation.inflow_prior import InflowPrior
 from eitbench.estimation.inflow_response import ImpulseResponse, steady_response
@@ -66,19 +66,20 @@ class InflowWindow(StateSpace):
         Lag of the oldest state to be estimated, in time steps.
     responses : sequence of ImpulseResponse, optional
         Responses of the states t = 1, 2, …; the last one is used for all later states. Default:
-        the steady response of the task's flow.
-    residual_covariance : (q, q), optional
-        Covariance of the deviation from the response in its basis, relative to c_ref.
+        the response of the ``model``, or the steady response of the task's flow.
+    model : IdentifiedModel, optional
+        Identified response, and covariance of the deviation from it.
     """
 
     def __init__(self, task: Task, prior: InflowPrior, c_ref: float, lag: int = 0, *,
                  responses: Sequence[ImpulseResponse] | None = None,
-                 residual_covariance: np.ndarray | None = None) -> None:
+                 model: IdentifiedModel | None = None) -> None:
         prior.check_task(task)
         self.prior = prior
         self.c_ref = c_ref
-        self.residual_covariance = residual_covariance
-        self.responses = responses or [steady_response(task.transport)]
+        self.residual_covariance = None if model is None else model.residual_covariance
+        self.responses = responses or [
+            steady_response(task.transport) if model is None else model.response]
         self.response_steps = self.responses[0].weights.shape[1]
         """K, length of the response in time steps"""
         self.n_modes = prior.modes.shape[1]
@@ -165,13 +166,8 @@ def inflow_filter(task: Task, prior: InflowPrior, c_ref: float, lag: int = 0, *,
     iterated : bool
         Linearise each measurement vector a second time, about the first estimate.
     """
-    forward: Forward = linearise_at_prediction(task)
-    if model is None:
-        space = InflowWindow(task, prior, c_ref, lag, responses=responses)
-    else:
-        space = InflowWindow(task, prior, c_ref, lag, responses=[model.response],
-                             residual_covariance=model.residual_covariance)
-        forward = model.forward(task, c_ref)
+    space = InflowWindow(task, prior, c_ref, lag, responses=responses, model=model)
+    forward = linearise_at_prediction(task) if model is None else model.forward(task, c_ref)
     return Filter(space, forward, iterated=iterated)
 
 

@@ -141,19 +141,9 @@ def nodal_states(transport: Transport, prior: Prior, c_ref: float,
 
     The evolution is c⁺ = F c + Y c_in + w. Inflow and initial state have mean ĉ_bh; Γ_η and Γ_e are
     diagonal, Γ_{0|0} is diagonal or smooth. As all of them scale with ĉ_bh², the open-loop
-    covariance is computed once per transport model and used in all episodes. Without an inlet it
-    has no limit, and the covariance is dense.
-
-    Parameters
-    ----------
-    transport
-        Transport model, `Task.transport`.
-    prior : Prior
-        `Task.prior`.
-    c_ref : float
-        Best homogeneous estimate ĉ_bh in mol/m³.
-    rank_tolerance : float
-        As in `LowRankCovariance`, with an inlet.
+    covariance is computed once per transport model and used in all episodes, in a
+    `LowRankCovariance` of this ``rank_tolerance``. Without an inlet it has no limit, and the
+    covariance is dense. ``c_ref`` is ĉ_bh in mol/m³.
     """
     mean = np.full(transport.mesh.n_nodes, c_ref)
     if len(transport.inlet) and not isinstance(transport, StationaryTransport):

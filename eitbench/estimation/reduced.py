@@ -114,9 +114,8 @@ class ReducedStates(Protocol):
 
     basis: np.ndarray
     """(n, q) basis of the concentration's deviation, relative to c_ref"""
-
-    def initial(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return mean (s,) and covariance (s, s) at t = 0."""
+    start: tuple[np.ndarray, np.ndarray]
+    """mean (s,) and covariance (s, s) at t = 0"""
 
     def step(self, mean: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return the Jacobian of a step at a mean (s,), its noise covariance, (s, s) each, and the
@@ -148,9 +147,7 @@ class SteadyStates(ReducedStates):
     def __init__(self, model: ReducedModel) -> None:
         self.model = model
         self.basis = model.basis
-
-    def initial(self) -> tuple[np.ndarray, np.ndarray]:
-        return np.zeros_like(self.model.initial[0]), self.model.initial
+        self.start = np.zeros_like(model.initial[0]), model.initial
 
     def step(self, mean: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         A = self.model.transition
@@ -176,7 +173,7 @@ class ReducedFilter:
 
     def __init__(self, states: ReducedStates, episodes: int) -> None:
         self.states = states
-        mean, covariance = states.initial()
+        mean, covariance = states.start
         self.mean = np.repeat(mean[None], episodes, axis=0)
         self.covariance = np.repeat(covariance[None], episodes, axis=0)
         self.innovation_covariance = np.empty((episodes, 0, 0))
@@ -277,15 +274,12 @@ class JointStates(ReducedStates):
         self.basis = model.basis
         self.tables = TransitionSplines(model)
         r, dtype = len(model.initial), model.initial.dtype
-        self._mean: np.ndarray = np.append(np.zeros(r), nominal).astype(dtype)
-        self._covariance: np.ndarray = np.zeros((r + 1, r + 1), dtype)
-        self._covariance[:r, :r] = model.initial
-        self._covariance[r, r] = std**2
+        covariance: np.ndarray = np.zeros((r + 1, r + 1), dtype)
+        covariance[:r, :r] = model.initial
+        covariance[r, r] = std**2
+        self.start = np.append(np.zeros(r), nominal).astype(dtype), covariance
         self._walk_variance = walk_std**2
         self._bounds = bounds
-
-    def initial(self) -> tuple[np.ndarray, np.ndarray]:
-        return self._mean, self._covariance
 
     def step(self, mean: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         A, slope, W = self.tables.evaluate(mean[..., -1])

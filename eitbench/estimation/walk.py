@@ -22,18 +22,10 @@ def smoothness_covariance(mesh: Mesh, length: float, std: float) -> np.ndarray:
     """Return Γ = s·(M + ℓ²K)⁻¹ M (M + ℓ²K)⁻¹, (n, n), a proper smoothness prior.
 
     The field x solves x − ℓ²∆x = white noise with ∂x/∂n = 0 on the wall: in free space it is a
-    Matérn field with correlation 0.60 at distance ℓ and 0.12 at 3ℓ (Lindgren, Rue & Lindström
-    2011), rougher in 3D than in 2D. The factor s scales the mean variance, weighted by M, to std².
-    Gauss–Newton uses Γ⁻¹ as its penalty. The array is cached and read-only.
-
-    Parameters
-    ----------
-    mesh : Mesh
-        Mesh of the field, with mass matrix M and stiffness matrix K.
-    length : float
-        ℓ in m, > 0.
-    std : float
-        > 0, in the unit of the field.
+    Matérn field with correlation 0.60 at the distance ``length`` ℓ in m and 0.12 at 3ℓ (Lindgren,
+    Rue & Lindström 2011), rougher in 3D than in 2D. M and K are the mass and the stiffness matrix;
+    the factor s scales the mean variance, weighted by M, to ``std``². Gauss–Newton uses Γ⁻¹ as its
+    penalty. The array is cached and read-only.
     """
     _check.number("length", length, low=0.0, open_low=True, units="m")
     _check.number("std", std, low=0.0, open_low=True)
@@ -115,10 +107,10 @@ class RandomWalk:
 
     def evolution_model(self) -> EvolutionModel:
         """Return F, an empty Y and H, where H Hᵀ is `covariance`."""
-        F, Y = self.transition()
-        return EvolutionModel(F, Y, np.linalg.cholesky(self.covariance))
+        n = self.mesh.n_nodes
+        return EvolutionModel(self.step(np.eye(n)), np.zeros((n, 0)),
+                              np.linalg.cholesky(self.covariance))
 
     def transition(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return F and the empty Y of `evolution_model`."""
-        n = self.mesh.n_nodes
-        return self.step(np.eye(n)), np.zeros((n, 0))
+        """Return F and Y of `evolution_model`."""
+        return self.evolution_model()[:2]

@@ -59,7 +59,7 @@ def test_reduced_derivatives_are_those_of_the_steps(parts):
     contribution that leaves the pipe."""
     model = parts[2]
     states, rng = InflowStates(model), np.random.default_rng(1)
-    first = states.initial()
+    first = states.start
     after = states.propagate(*(part[None] for part in first))[1][0]
     np.testing.assert_allclose(after, first[1], atol=0.02 * np.abs(first[1]).max())
     mean = 0.3 * rng.standard_normal((2, len(model.initial)))

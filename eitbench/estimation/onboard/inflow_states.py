@@ -118,9 +118,7 @@ class InflowStates(ReducedStates):
         self._older = model.weights[:h, -1]
         self._shape = recent - 1, model.modes.shape[1]
         self._inlet = inlet
-
-    def initial(self) -> tuple[np.ndarray, np.ndarray]:
-        return np.zeros(len(self.model.initial), self.model.initial.dtype), self.model.initial
+        self.start = np.zeros(len(model.initial), model.initial.dtype), model.initial
 
     def propagate(self, mean: np.ndarray,
                   covariance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
