@@ -2,9 +2,8 @@
 training episodes, for a lag of four measurements.
 
 The network is as in `learned_correction`; its inputs include the filter's present estimates of the
-present state and of the state four steps ago. `studies/learn.py` trains it; inference needs numpy
-and the network file, which only a checkout contains. After the last measurement, when the lag
-shrinks, the filter's estimates are not corrected.
+present state and of the state four steps ago. After the last measurement, when the lag shrinks, the
+filter's estimates are not corrected.
 """
 
 from eitbench import Task

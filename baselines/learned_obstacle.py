@@ -1,8 +1,7 @@
 """Recurrent network that corrects the filter with identified flow: trained in a pipe with an
 obstacle, where the velocity profile differs from the model's parabola.
 
-The network is as in `learned_correction`, the filter as in `identified_flow`. `studies/learn.py`
-trains it; inference needs numpy and the network file, which only a checkout contains.
+The network is as in `learned_correction`, the filter as in `identified_flow`.
 """
 
 from eitbench.estimation import NetworkEstimator

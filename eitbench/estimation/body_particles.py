@@ -165,6 +165,9 @@ class BodyModel:
                           1e-3 * np.abs(voltages).max(axis=-1, keepdims=True))
 
 
+body_model = lru_cache(maxsize=4)(BodyModel)  # built once per process
+
+
 class BodyParticleFilter:
     """Particle filters of B episodes with K bodies: proposals from the motion with more entries,
     systematic resampling. The concentration of the liquid is known, and signals of bodies add up.
@@ -343,9 +346,3 @@ class BodyTracker:
         innovation, S, _ = found.innovation
         return Estimate(self._level + found.mean(images)[0], found.variance(images)[0],
                         innovation[0], S[0])
-
-
-@lru_cache(maxsize=4)
-def body_model(task: Task) -> BodyModel:
-    """Return the model of a task's body, built once per process."""
-    return BodyModel(task)
