@@ -169,16 +169,9 @@ body_model = lru_cache(maxsize=4)(BodyModel)  # built once per process
 
 
 class BodyParticleFilter:
-    """Particle filters of B episodes with K bodies: proposals from the motion with more entries,
-    systematic resampling. The concentration of the liquid is known, and signals of bodies add up.
-
-    Parameters
-    ----------
-    model : BodyModel
-    episodes : int
-        B.
-    n_particles : int
-        Number of particles of one body; see `PARTICLES`.
+    """Particle filters of B ``episodes`` with K bodies: proposals from the motion with more
+    entries, systematic resampling. The concentration of the liquid is known, and signals of bodies
+    add up. ``n_particles`` is the number with one body; see `PARTICLES`.
 
     Attributes
     ----------

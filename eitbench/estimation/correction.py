@@ -86,19 +86,8 @@ def _sigmoid(x: np.ndarray) -> np.ndarray:
 
 
 class FilterFeatures:
-    """Features of an episode from the filter of the `InflowWindow`.
-
-    Parameters
-    ----------
-    task, prior, c_ref
-        As in `InflowWindow`.
-    basis : (n, q)
-        Modes of c/ĉ_bh − 1.
-    lag : int
-        Lag of the oldest requested state, in time steps.
-    model : IdentifiedModel, optional
-        Model of the filter, as in `baselines/identified_flow.py`.
-    """
+    """Features of an episode from the filter of the `InflowWindow`, in modes ``basis`` (n, q) of
+    c/ĉ_bh − 1; the other arguments are as in `inflow_filter`."""
 
     def __init__(self, task: Task, prior: InflowPrior, c_ref: float, basis: np.ndarray,
                  lag: int = 0, model: IdentifiedModel | None = None) -> None:
@@ -166,16 +155,10 @@ class VoltageFeatures:
 
 
 class NetworkCorrectedFilter:
-    """Filter with a network correction, for `FilterEstimator`.
+    """Filter with a network correction of its ``features``, for `FilterEstimator`.
 
     After the last measurement, when the lag shrinks, it returns the estimates of the filter alone.
-
-    Parameters
-    ----------
-    network : mapping
-        As returned by `load_network`.
-    features : FilterFeatures or VoltageFeatures
-        Inputs of the network; `VoltageFeatures` has no lag.
+    `VoltageFeatures` have no lag.
     """
 
     def __init__(self, network: Network, features: FilterFeatures | VoltageFeatures) -> None:

@@ -133,15 +133,8 @@ class StationaryMap:
     `FilterEstimator`.
 
     A function u of the relative concentration c/ĉ_bh has the prior N(0, Γ_{0|0}), with the initial
-    covariance of the Kalman filter. Gauss–Newton starts from the previous estimate.
-
-    Parameters
-    ----------
-    task : Task
-    c_ref : float
-        ĉ_bh in mol/m³.
-    relative : callable
-        u (n,) -> c/ĉ_bh and its derivative by u, node by node.
+    covariance of the Kalman filter. ``relative`` maps u (n,) to c/ĉ_bh and its derivative by u,
+    node by node, and ``c_ref`` is ĉ_bh in mol/m³. Gauss–Newton starts from the previous estimate.
     """
 
     def __init__(self, task: Task, c_ref: float,

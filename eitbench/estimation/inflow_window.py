@@ -155,17 +155,8 @@ def shift_window(mean: np.ndarray, weights: np.ndarray) -> np.ndarray:
 def inflow_filter(task: Task, prior: InflowPrior, c_ref: float, lag: int = 0, *,
                   responses: Sequence[ImpulseResponse] | None = None,
                   model: IdentifiedModel | None = None, iterated: bool = False) -> Filter:
-    """Return the extended Kalman filter of the inflow window.
-
-    Parameters
-    ----------
-    task, prior, c_ref, lag, responses
-        As in `InflowWindow`.
-    model : IdentifiedModel, optional
-        Model whose response and errors replace the task's flow.
-    iterated : bool
-        Linearise each measurement vector a second time, about the first estimate.
-    """
+    """Return the extended Kalman filter of an `InflowWindow`, with the voltage errors of the
+    ``model``, if any; ``iterated`` as in `Filter`."""
     space = InflowWindow(task, prior, c_ref, lag, responses=responses, model=model)
     forward = linearise_at_prediction(task) if model is None else model.forward(task, c_ref)
     return Filter(space, forward, iterated=iterated)

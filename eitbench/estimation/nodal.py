@@ -103,16 +103,10 @@ class NodalStates(StateSpace):
 
 
 class LogStates(NodalStates):
-    """Logarithm of the concentration, c = ĉ_bh exp(E x_1), with x_1 the first entries of a state.
+    """Logarithm of the concentration, c = ĉ_bh exp(E x_1), with x_1 the first entries of a state x.
 
-    Parameters
-    ----------
-    states : NodalStates
-        Initial covariance and motion of x, whose initial mean is zero.
-    c_ref : float
-        ĉ_bh in mol/m³.
-    modes : (n, K), optional
-        E; default: identity.
+    ``states`` has the initial covariance and the motion of x, whose initial mean is zero; ``c_ref``
+    is ĉ_bh in mol/m³, and ``modes`` is E (n, K), by default the identity.
     """
 
     def __init__(self, states: NodalStates, c_ref: float, modes: np.ndarray | None = None) -> None:

@@ -155,13 +155,7 @@ class SteadyStates(ReducedStates):
 
 
 class ReducedFilter:
-    """Kalman filters of a batch of B episodes, each with its own injections.
-
-    Parameters
-    ----------
-    states : ReducedStates
-    episodes : int
-        B.
+    """Kalman filters of a batch of B ``episodes``, each with its own injections.
 
     Attributes
     ----------

@@ -129,15 +129,8 @@ class ParticleInflowFilter(SwitchingInflowFilter):
     """Rao–Blackwellised particle filter of the two regimes; a particle is a regime sequence.
 
     Each particle has a Kalman filter, linearised about its own prediction. At each step the
-    particles are resampled and branch into both regimes. With at most ``particles`` sequences the
-    result is exact except for the linearisation.
-
-    Parameters
-    ----------
-    task, prior, c_ref, level_std, forward
-        As in `SwitchingInflowFilter`.
-    particles : int
-        Number N ≥ 1 of branching particles; 2 N filters run.
+    particles are resampled, and N ≥ 1 ``particles`` branch into both regimes, so that 2 N filters
+    run. With at most N sequences the result is exact except for the linearisation.
     """
 
     def __init__(self, task: Task, prior: InflowPrior, c_ref: float, level_std: float,

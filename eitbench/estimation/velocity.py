@@ -177,15 +177,8 @@ class VelocityInflowWindow(StateSpace):
     propagated column by column. The link between c_in and x is linearised at each measurement
     vector. Contributions older than W steps remain in the mean, without uncertainty.
 
-    θ is projected onto the flow's bounds, without a change of the concentration.
-
-    Parameters
-    ----------
-    task, prior, c_ref
-        As in `InflowWindow`.
-    flow : VelocityPrior
-    window_steps : int
-        W in time steps; should exceed the residence time.
+    θ is projected onto the flow's bounds, without a change of the concentration. ``window_steps`` W
+    should exceed the residence time; the other arguments are as in `InflowWindow`.
     """
 
     def __init__(self, task: Task, prior: InflowPrior, c_ref: float, flow: VelocityPrior,
