@@ -93,6 +93,7 @@ LinearisedMeasurement = tuple[LinearMeasurement, np.ndarray, np.ndarray]
 
 class Filter:
     """Kalman filter on a state space; extended (EKF) where concentration or voltages are nonlinear.
+    ``mean`` and ``covariance`` are of the present state.
 
     Parameters
     ----------
@@ -103,11 +104,6 @@ class Filter:
         Innovation gate: larger deviations, in predicted standard deviations, are rejected.
     iterated : bool
         `assimilate` linearises each measurement vector a second time, about the first estimate.
-
-    Attributes
-    ----------
-    mean, covariance
-        Mean and covariance of the present state.
     """
 
     def __init__(self, space: StateSpace, forward: Forward | None = None, *,

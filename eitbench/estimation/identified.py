@@ -220,12 +220,8 @@ class RegressionSums(NamedTuple):
     """(n, n) Σ l lᵀ"""
     state: np.ndarray
     """(n, n) Σ d dᵀ"""
-    off: np.ndarray
-    """(P, L) Σ of voltage errors, in standard deviations of the noise"""
-    scatter: np.ndarray
-    """(P, L, L) Σ of their products"""
-    compared: np.ndarray
-    """(P,) number of measurement vectors in these sums"""
+    errors: np.ndarray
+    """(P, L + 1, L + 1) Σ e eᵀ, e = (voltage errors in standard deviations of the noise, 1)"""
 
 
 def identify_model(examples: Dataset, *, modes: int = 64, residual_only: bool = False,
@@ -294,9 +290,9 @@ def identify_model(examples: Dataset, *, modes: int = 64, residual_only: bool = 
     left = (to_modes.T @ moments.left @ to_modes - explained - explained.T
             + weights.T @ moments.inflow @ weights)
     weights = weights + known.T @ to_modes
-    compared = np.maximum(moments.compared, 1)
-    bias = moments.off / compared[:, None]
-    scatter = moments.scatter / compared[:, None, None] - bias[:, :, None] * bias[:, None]
+    mean = moments.errors / np.maximum(moments.errors[:, -1:, -1:], 1.0)
+    bias = mean[:, :-1, -1]
+    scatter = mean[:, :-1, :-1] - bias[:, :, None] * bias[:, None]
     return IdentifiedModel(basis, weights.T.reshape(q, memory, -1), across,
                            0.5 * (left + left.T) / free, task.currents, bias,
                            task_fingerprint(task), world.background, source or {},
@@ -353,11 +349,10 @@ def _moments(example: Example, world: World, task: Task, across: np.ndarray, kno
     l = d - s @ known.T
     steps, errors = _errors(task, example, linearised)
     P, L = task.currents.shape
-    off, scatter = np.zeros((P, L)), np.zeros((P, L, L))
-    np.add.at(off, steps % P, errors)
-    np.add.at(scatter, steps % P, errors[:, :, None] * errors[:, None])
-    return RegressionSums(len(d), s.T @ s, s.T @ l, l.T @ l, d.T @ d, off, scatter,
-                          np.bincount(steps % P, minlength=P))
+    e = np.append(errors, np.ones((len(errors), 1)), axis=1)
+    products = np.zeros((P, L + 1, L + 1))
+    np.add.at(products, steps % P, e[:, :, None] * e[:, None])
+    return RegressionSums(len(d), s.T @ s, s.T @ l, l.T @ l, d.T @ d, products)
 
 
 def _errors(task: Task, example: Example, linearised: bool) -> tuple[np.ndarray, np.ndarray]:
