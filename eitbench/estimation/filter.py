@@ -85,6 +85,8 @@ class Step(NamedTuple):
     """(n, m) P_{t|t−1} Hᵀ"""
     accepted: np.ndarray
     """(m,) bool: measurements that passed the gate; the fields above include all measurements"""
+    variance: np.ndarray | None = None
+    """(n,) diagonal of P_{t|t}; only `kalman_filter` sets it"""
 
 
 LinearisedMeasurement = tuple[LinearMeasurement, np.ndarray, np.ndarray]
@@ -191,5 +193,6 @@ def kalman_filter(start: Filter, observations: Iterable[LinearMeasurement]) -> l
     steps = []
     for observation in observations:
         start.predict()
-        steps.append(start.update(observation))
+        step = start.update(observation)
+        steps.append(step._replace(variance=start.covariance.diagonal()))
     return steps

@@ -288,11 +288,10 @@ def test_the_pipe_of_the_thesis():
                            (LEVEL / 4)**2 * np.eye(n))
     filters = [nodal_filter(transport, PIPE_2D.prior, LEVEL, rank_tolerance=1e-6) for _ in range(2)]
     seen, _ = measured(filters[0], [model] * T, m=8)
-    for observation, (predicted, filtered) in zip(seen, dense_filter(model, seen), strict=True):
-        (step,) = kalman_filter(filters[0], [observation])
+    for step, (predicted, filtered) in zip(kalman_filter(filters[0], seen), dense_filter(model, seen), strict=True):
         assert_close(step.predicted_mean, predicted.mean)
         assert_close(step.mean, filtered.mean)
-        np.testing.assert_allclose(filters[0].variance, filtered.variance, atol=1e-9 * predicted.variance.max())
+        np.testing.assert_allclose(step.variance, filtered.variance, atol=1e-9 * predicted.variance.max())
     for state, expected in zip(fixed_interval_smoother(filters[1], seen), stacked([model] * T, seen), strict=True):
         assert_close(state.mean, expected.mean)
         assert_close(state.variance, expected.variance)
