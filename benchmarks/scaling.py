@@ -12,7 +12,7 @@ from pathlib import Path
 import matplotlib
 import numpy as np
 from common import best_of, in_fresh_process, peak_growth
-from forward import conductivities, electrode_model, pipe_mesh
+from forward import conductivities, electrode_model, forget, pipe_mesh
 from pipe_record import STEPS, WARM_UP, problem
 from stepping import COUNTS, environments
 
@@ -75,7 +75,7 @@ def forward_model(cells: tuple[int, int]) -> tuple[float, float, float]:
 
     memory = peak_growth(build)
     cem, sigma = models[0]
-    return cem.n_unknowns, best_of(lambda: cem.transfer_resistance(sigma), 15), memory
+    return cem.n_unknowns, best_of(lambda: forget(cem).transfer_resistance(sigma), 15), memory
 
 
 def kalman_step(cells: tuple[int, int]) -> tuple[float, float, float]:
