@@ -33,7 +33,10 @@ TASKS = {
 import numpy as np, gymnasium, eitbench
 task = gymnasium.make("eitbench/Pipe2D-v0").unwrapped.task
 c = np.full(task.mesh.n_nodes, 25.0)
-fastest(lambda: task.observation.voltages(c, task.currents), 50)
+def solve():
+    c[:] += 1e-3                        # results for the last concentration are kept
+    task.observation.voltages(c, task.currents)
+fastest(solve, 50)
 """,
     "filter step": TIMER + """
 import numpy as np, gymnasium, eitbench
