@@ -125,7 +125,9 @@ class ReducedStates(Protocol):
                   covariance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return mean (B, s) and covariance (B, s, s) one time step later."""
         F, noise, after = self.step(mean)
-        return after, F @ covariance @ np.swapaxes(F, -1, -2) + noise
+        moved = F @ covariance @ np.swapaxes(F, -1, -2)
+        moved += noise
+        return after, moved
 
     def coordinates(self, mean: np.ndarray) -> np.ndarray:
         """Return the coordinates (B, q) of the concentration."""
