@@ -26,18 +26,20 @@ MAX_EXCESS = 3.0
 class AdaptiveFilter(Filter):
     """Filter of an inflow window that changes q after each measurement."""
 
+    space: InflowWindow
+
     def __init__(self, task: Task, c_ref: float) -> None:
         points = task.mesh.points[task.transport.inlet]
         white = InflowPrior("linear", points, task.prior.inflow_std * np.eye(len(points)),
                             np.ones(1), task.transport.time_step)
-        self.window = InflowWindow(task, white, c_ref)
-        super().__init__(self.window, linearise_at_prediction(task))
-        self.weights, self.variances = self.window.ar_model
+        space = InflowWindow(task, white, c_ref)
+        super().__init__(space, linearise_at_prediction(task))
+        self.weights, self.variances = space.ar_model
         self.log_q = 0.0
 
     def assimilate(self, voltages: np.ndarray, currents: np.ndarray) -> Step:
         """Predict, condition on voltages (L,) in V for an injection (L,) in A, and change q."""
-        self.window.ar_model = self.weights, np.exp(self.log_q) * self.variances
+        self.space.ar_model = self.weights, np.exp(self.log_q) * self.variances
         step = super().assimilate(voltages, currents)
         used = step.accepted
         if not used.any():

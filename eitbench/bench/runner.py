@@ -42,7 +42,7 @@ class EpisodeRun(NamedTuple):
     """Results of a method in one episode."""
 
     outcome: Outcome
-    fields: dict[str, np.ndarray] = {}  # noqa: RUF012 (never changed)
+    fields: dict[str, np.ndarray]
     """Means and standard deviations of estimates as float32, for figures; empty for policies and on
     measurements."""
     currents: np.ndarray = np.empty((0, 0))
@@ -85,7 +85,7 @@ def run_method(asked: Environment, method: Method, seed: int) -> EpisodeRun:
         return _run_policy(env, method, seed)
     if is_measured(asked.id):
         run = run_on_measurements(env, method, seed, kept={env.episode_steps})
-        return EpisodeRun(run.outcome(env))
+        return EpisodeRun(run.outcome(env), {})
     return run_estimator(env, method, seed)
 
 

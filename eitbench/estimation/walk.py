@@ -107,10 +107,9 @@ class RandomWalk:
 
     def evolution_model(self) -> EvolutionModel:
         """Return F, an empty Y and H, where H Hᵀ is `covariance`."""
-        n = self.mesh.n_nodes
-        return EvolutionModel(self.step(np.eye(n)), np.zeros((n, 0)),
-                              np.linalg.cholesky(self.covariance))
+        return EvolutionModel(*self.transition(), np.linalg.cholesky(self.covariance))
 
     def transition(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return F and Y of `evolution_model`."""
-        return self.evolution_model()[:2]
+        """Return F and the empty Y of `evolution_model`."""
+        n = self.mesh.n_nodes
+        return self.step(np.eye(n)), np.zeros((n, 0))

@@ -48,25 +48,27 @@ class PairLogits(nn.Module):
         return logits
 
 
-class _WithPairLogits:
-    """Mixin of an actor-critic policy whose network of the action is `PairLogits`."""
-
-    action_net: Any
-
-    def _build(self: Any, lr_schedule: Schedule) -> None:
-        super()._build(lr_schedule)  # type: ignore[misc]
-        pairs, *readings = _sizes(self)
-        self.action_net = PairLogits(self.mlp_extractor.latent_dim_pi, pairs, sum(readings))
-        self.optimizer = self.optimizer_class(self.parameters(), lr=lr_schedule(1),
-                                              **self.optimizer_kwargs)
-
-
-class PairPolicy(_WithPairLogits, ActorCriticPolicy):
+class PairPolicy(ActorCriticPolicy):
     """Policy of PPO with `PairLogits`."""
 
+    def _build(self, lr_schedule: Schedule) -> None:
+        super()._build(lr_schedule)
+        _with_pairs(self, lr_schedule)
 
-class MaskablePairPolicy(_WithPairLogits, MaskableActorCriticPolicy):
+
+class MaskablePairPolicy(MaskableActorCriticPolicy):
     """Policy of PPO with action masks and `PairLogits`."""
+
+    def _build(self, lr_schedule: Schedule) -> None:
+        super()._build(lr_schedule)
+        _with_pairs(self, lr_schedule)
+
+
+def _with_pairs(policy: Any, lr_schedule: Schedule) -> None:
+    pairs, *readings = _sizes(policy)
+    policy.action_net = PairLogits(policy.mlp_extractor.latent_dim_pi, pairs, sum(readings))
+    policy.optimizer = policy.optimizer_class(policy.parameters(), lr=lr_schedule(1),
+                                              **policy.optimizer_kwargs)
 
 
 def most_probable(policy: PairPolicy | MaskablePairPolicy, observation: np.ndarray,

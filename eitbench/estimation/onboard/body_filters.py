@@ -31,6 +31,9 @@ class BodyFilters(EpisodeFilters):
 
     n_particles = 512
 
+    def _reference_indices(self, frames: np.ndarray) -> list[int]:
+        return [0] * len(frames)
+
     def _start(self, episodes: int) -> None:
         self.filter = BodyParticleFilter(body_model(self.table.task), episodes, self.n_particles)
         self.patches = body_patches(self._rules.world.fault_free)

@@ -59,9 +59,8 @@ class EpisodeFilters:
                        if rules.faults == "estimated" else None)
         """None: measurements beyond the gate are rejected"""
         self.table = linearisation_table(rules.world)
-        robust = math.isfinite(rules.gate) or self.faults is not None
-        self.indices = [0] * B if rules.tracks_body else self.table.nearest_indices(frames, robust)
-        """indices of c_ref in the table; with bodies the concentration of the liquid is known"""
+        self.indices = self._reference_indices(frames)
+        """indices of c_ref in the table"""
         self.c_ref = np.array([self.table.c_ref(k) for k in self.indices])
         """(B,) ĉ_bh in mol/m³"""
         self._start(B)
@@ -69,6 +68,11 @@ class EpisodeFilters:
             self._condition(frames[:, k], np.repeat(currents[None], B, axis=0))
         self._innovations = np.zeros((B, L))
         self._doubt = np.zeros((B, 2, L))
+
+    def _reference_indices(self, frames: np.ndarray) -> list[int]:
+        """Return the index of c_ref of each episode in the table, from the first frame."""
+        robust = math.isfinite(self._rules.gate) or self.faults is not None
+        return self.table.nearest_indices(frames, robust)
 
     def _start(self, episodes: int) -> None:
         """Create the filters at t = 0."""

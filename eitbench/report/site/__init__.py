@@ -157,6 +157,7 @@ def write_site(folder: Path, files: Mapping[str, bytes]) -> None:
 def index_page(site: Site) -> bytes:
     """Return the HTML of ``index.html``."""
     apart = {environment_name(id, {}) for id, each in entries().items() if each.is_reference}
+    together = boards.aggregate_environments()
     shown = {board.anchor: tables.page_table(board, "", compact=True) for board in site.boards
              if board.environment not in apart}
     filters, policies = site.board("filter", ALL), site.board("injection", AGENT_ENVIRONMENT)
@@ -165,9 +166,8 @@ def index_page(site: Site) -> bytes:
     return site.page(
         "index", headline=headline(site), filters=filters, policies=policies,
         best_filters=best[0], best_policies=best[1],
-        n_filter_environments=sum(
-            board.category == "filter" and board.environment in boards.aggregate_environments()
-            for board in site.boards),
+        n_filter_environments=sum(board.category == "filter" and board.environment in together
+                                  for board in site.boards),
         moving=site.address(HEADLINE[0]), still=site.address(HEADLINE[1]),
         shown=shown, about=CATEGORY_TEXTS,
         last=max(map(stored.finished_at, site.records), default="")[:10],
