@@ -6,6 +6,7 @@ from dataclasses import KW_ONLY, dataclass
 from typing import Any
 
 import numpy as np
+import scipy.sparse as sp
 
 from eitbench.measured.measurements import Measurements
 from eitbench.physics.cem import CompleteElectrodeModel
@@ -46,6 +47,11 @@ class MeasurementModel:
     def cem(self) -> CompleteElectrodeModel:
         """The electrode model."""
         return self.observation.cem
+
+    @property
+    def interpolation(self) -> sp.csr_array:
+        """Matrix from nodal values of concentration to nodes of the electrode mesh."""
+        return self.observation.interpolation
 
     def voltages(self, concentration: np.ndarray, currents: np.ndarray) -> np.ndarray:
         """Predict voltages (J, M) in V for a concentration (n,) in mol/m³, currents (J, L) in A."""

@@ -13,7 +13,18 @@ from eitbench.envs.measured import MeasuredEnv
 from eitbench.estimation.walk import matern32_transition, matern_modes
 from eitbench.measured import Measurements
 from eitbench.measured.vessel import read_vessel
-from tanks import CYLINDER, FIXED_STDS, PIPE, VESSEL, angle, centroid, instrument, moving, simulate_measurements
+from tanks import (
+    CYLINDER,
+    FIXED_STDS,
+    PIPE,
+    VESSEL,
+    angle,
+    centroid,
+    instrument,
+    moving,
+    simulate_measurements,
+    stationary,
+)
 
 from commands import eitbench
 
@@ -37,6 +48,14 @@ def test_filters_are_better_than_naive_baselines(env, runs):
     errors = [centroid(env.task.mesh.points, runs["log_walk_filter"].mean[t])
               - 0.05 * np.array([np.cos(angle(t, T)), np.sin(angle(t, T))]) for t in range(16, T)]
     assert np.linalg.norm(errors, axis=1).mean() < 0.015
+
+
+@pytest.mark.parametrize("method", ["back_projection", "noser", "temporal_regularisation"])
+def test_images_of_a_frame_find_the_inclusion(method):
+    """Its centre is (5 cm, 0); the images are blurred."""
+    env = MeasuredEnv(stationary(), VESSEL, initial_std=0.2)
+    found = centroid(env.task.mesh.points, run_on_measurements(env, method).mean[-1])
+    np.testing.assert_allclose(found, [0.05, 0.0], atol=0.02)
 
 
 def test_a_failing_contact_is_visible():
