@@ -92,10 +92,9 @@ def one_step(model: VoltageModel, voltages: np.ndarray, currents: np.ndarray,
     weight = 1.0 / noise_std[measured]
     A = jacobian[measured] * weight[:, None]
     squares = (A**2).sum(axis=0)
-    cross = A.T / (strength**2 * np.maximum(squares, 1e-6 * squares.max())**power)[:, None]
+    inverse = strength**2 * np.maximum(squares, 1e-6 * squares.max())**power
     residual = (voltages - computed)[measured] * weight
-    solution: np.ndarray = cross @ cho_solve(cho_factor(A @ cross + np.eye(len(A))), residual)
-    return start + solution
+    return start + _NormalEquations(sp.diags_array(inverse)).solve(A, A.T @ residual)
 
 
 def nearest_observed(task: Task) -> np.ndarray:
