@@ -1,7 +1,8 @@
 """Log-inflow filter with the true flow of each step: an oracle for `docs/turbulence.md`.
 
-`eitbench run --baseline studies/true_flow_filter.py --env eitbench/Pipe2DTurbulent-v0` compares it
-with filters that assume the mean flow: its error is due to the inflow, not the flow.
+`eitbench run --isolate none --baseline studies/true_flow_filter.py --env
+eitbench/Pipe2DTurbulent-v0` compares it with filters that assume the mean flow: its error is due
+to the inflow, not the flow.
 """
 
 from pathlib import Path
