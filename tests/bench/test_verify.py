@@ -339,12 +339,3 @@ def test_records_of_the_baseline_are_not_used():
     assert not problems and row["recorded"] == "1 (6)" and row["held-out"] == "1 (4)" and float(row["p"]) == 1.0
     with pytest.raises(ValueError, match="must be more for a test, got 1 and 6"):
         held_out.verify_held_out(read_record(path), Job(FILTER._replace(kwargs="{}"), "homogeneous", 0), SECRET, 1)
-
-
-def test_the_workflow_calls_an_existing_command():
-    """The options of the workflow exist in `verify`."""
-    text = (Path(held_out.__file__).parents[2] / ".github/workflows/submission.yml").read_text()
-    (call,) = re.findall(r"bin/eitbench (verify .*?)(?: >|\n)", text)
-    options = re.findall(r"--[a-z-]+", call)
-    code, said, _ = eitbench("verify", "--help")
-    assert code == 0 and options and all(option in said for option in options)
