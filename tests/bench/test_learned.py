@@ -148,13 +148,3 @@ def test_networks_are_compatible_with_their_training_task(id, changes, arguments
     task = make_task(entry(id).world.with_changes(changes), **dict(entry(id).settings) | arguments)
     found = {name for name in suitable | unsuitable if load_method(name, "estimation").suits(task)}
     assert found == suitable
-
-
-@pytest.mark.parametrize("name", LEARNED)
-def test_a_shipped_network_is_small(name):
-    """The file has plain arrays, two megabytes at most."""
-    method = load_method(name, "estimation")
-    path = Path(method.path).parent / method.parameters["network"]
-    assert path.stat().st_size < 2e6
-    with np.load(path, allow_pickle=False) as file:
-        assert all(file[name].dtype.kind == "f" for name in file.files)

@@ -1,6 +1,5 @@
 """Command line: runs, written files and error messages."""
 
-import json
 import re
 import sys
 from dataclasses import replace
@@ -35,26 +34,6 @@ def tiny_world(monkeypatch, tmp_path):
     registry.import_entries([lagged])
     monkeypatch.chdir(tmp_path)
     write_baseline(tmp_path, doc="My method: the same everywhere.")
-
-
-def test_a_users_file_has_a_table_and_a_page(tmp_path):
-    """A user's file is run, scored and shown next to built-in methods: on the terminal, as Markdown, HTML and JSON."""
-    code, said, _ = eitbench("run", "--env", PIPE, "--baseline", "mine.py", "--baseline", "homogeneous",
-                             "--seeds", "dev:0-1", "-j", "1")
-    assert code == 0 and "| mine " in said and "| homogeneous " in said
-    results = tmp_path / "results"
-    table = (results / "leaderboard.md").read_text(encoding="utf-8")
-    assert "My method" in table and "Best homogeneous estimate" in table and len(table.splitlines()) == 6
-    assert "My method" in (results / "index.html").read_text(encoding="utf-8")
-    assert "wrote results/index.html" in said
-    (path,) = (results / "records").glob("eitbench-Pipe2D-v0--mine--*--dev.json")
-    record = json.loads(path.read_text(encoding="utf-8"))
-    assert record["seeds"] == ["dev:0", "dev:1"] and record["environment"]["id"] == PIPE
-    assert all(episode["status"] == "ok" for episode in record["episodes"])
-    for name in ("leaderboard.md", "index.html"):
-        (results / name).unlink()
-    assert eitbench("leaderboard")[:2] == (0, said)                       # needs only the stored episodes
-    assert (results / "leaderboard.md").read_text(encoding="utf-8") == table and (results / "index.html").exists()
 
 
 def test_suites():
@@ -152,7 +131,6 @@ def test_documented_commands_are_commands():
     (["run", "--env", "Pipe2D"], "Did you mean eitbench/Pipe2D-v0?"),
     (["run", "--set", "instrument.noise_relativ=0.1"], "Did you mean noise_relative?"),
     (["run", "--baseline", "nowhere.py"], "baseline nowhere.py does not exist"),
-    (["run", "--baseline", "mine.py", "--baseline", "other/mine.py", "--seeds", "dev:1", "-j", "1"], "other/mine.py"),
     (["run", "--baseline", "kalman_filter", "--env", "eitbench/Pipe2DSmoothing-v0"],
      "baseline kalman_filter suits none of the environments"),
     (["leaderboard", "-o", "nothing"], "no results in nothing; create some with `eitbench run`"),
@@ -175,7 +153,6 @@ def test_documented_commands_are_commands():
 ])
 def test_mistakes_are_explained(arguments, message, tmp_path):
     """Exit code 2 and a sentence with the argument; no traceback, and no file is written."""
-    write_baseline(tmp_path / "other")
     code, said, complaint = eitbench(*arguments)
     assert code == 2 and said == ""
     assert message in complaint and "Traceback" not in complaint
