@@ -60,9 +60,10 @@ def injection_identity(name="random_pair", **given):
     return Job(Environment("eitbench/Pipe2DInjection-v0", json.dumps(given)), name, 1).identity()
 
 
-def test_a_changed_default_is_another_identity(monkeypatch):
+def test_a_changed_default_or_file_is_another_identity(tmp_path, monkeypatch):
     """The identity depends on the arguments of scored runs, of the registration, of the environment's class, and on the
-    version of scoring: earlier results are not reused. An explicit argument equal to the default does not change it."""
+    version of scoring: earlier results are not reused. An explicit argument equal to the default does not change it.
+    It also depends on a method's file, the configuration of a model, and the function that loads it."""
     before = injection_identity()
     assert injection_identity(estimator="full", gate=None) == before != injection_identity(estimator="reduced")
 
@@ -79,19 +80,13 @@ def test_a_changed_default_is_another_identity(monkeypatch):
             change(patch)
             found.add(injection_identity())
     assert len(found) == 5 and injection_identity() == before
-
-
-def test_files_and_loader_of_a_method_are_in_its_identity(tmp_path, monkeypatch):
-    """The identity depends on the file, the configuration of a model, and the function that loads it."""
     model = tmp_path / "model.zip"
-    found = set()
     for content, config in ((b"a", "{}"), (b"b", "{}"), (b"b", '{"algo": "ppo"}')):
         model.write_bytes(content)
         (tmp_path / "config.json").write_text(config)
         found.add(injection_identity(str(model)))
     monkeypatch.setattr(methods, "_loaders", lambda: {".zip": EntryPoint("zip", "mine:load", "eitbench.loaders")})
-    found.add(injection_identity(str(model)))
-    assert len(found) == 4
+    assert len(found | {injection_identity(str(model))}) == 9
 
 
 def test_a_script_with_a_custom_component_resumes(tmp_path):

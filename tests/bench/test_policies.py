@@ -48,13 +48,18 @@ def environment(name: str) -> InjectionEnv:
 
 @pytest.mark.parametrize("name", [NAME, INFLOW, FAULTS, BUDGET, FLOW])
 def test_belief_is_the_filter_inside(name):
-    """A belief that a policy updates equals the environment's reduced filter, to the bit."""
+    """A belief that a policy updates equals the environment's reduced filter, to the bit. A pair's action injects its
+    currents."""
     env = environment(name)
     observation, _ = env.reset(seed=SEED)
     belief = Belief(env.rules, observation)
     for pair in (7, 100, None if env.rules.budget else 3, 7):
         belief.predict_covariance()                                      # changes nothing
         observation, *_ = env.step(env.rules.action(pair))
+        expected = np.zeros(16)
+        if pair is not None:
+            expected[env.rules.pairs[pair]] = env.rules.amplitude, -env.rules.amplitude
+        np.testing.assert_allclose(observation["currents"], expected)
         belief.update(observation)
         inside = filter_of(env)
         np.testing.assert_array_equal(belief.mean, inside.means()[0])
@@ -114,22 +119,6 @@ def test_the_prior_belief_is_the_expected_concentration():
     about_c_ref = belief.linearisation.jacobian
     np.testing.assert_allclose(belief.relinearised_jacobian(), about_c_ref, rtol=0.1,
                                atol=0.02 * np.abs(about_c_ref).max())
-
-
-@pytest.mark.parametrize("name", list(KWARGS))
-def test_the_action_of_a_pair_injects_it(name):
-    """A pair's action injects its currents in every world; the action without injection has no current."""
-    rules = environment(name).rules
-    action = rules.action(21)
-    assert rules.action_space.contains(np.int64(action) if rules.limit is None else action)
-    expected = np.zeros((1, 16))
-    expected[0, rules.pairs[21]] = rules.amplitude, -rules.amplitude
-    np.testing.assert_allclose(rules.currents(np.array([action])), expected, rtol=1e-6)
-    if rules.limit is None and rules.budget is None:
-        with pytest.raises(ValueError, match="pair must be a number in a world without a budget, got None"):
-            rules.action(None)
-    else:
-        assert not rules.currents(np.array([rules.action(None)])).any()
 
 
 @pytest.mark.parametrize("budget", [0, 1, 7, 30, 182, 500])

@@ -40,7 +40,12 @@ def changed(path, value, whole=MINE):
 
 
 def test_round_trip(tmp_path):
-    """The file that is read equals what was written, to the last bit; environment, method and version name it."""
+    """The file that is read equals what was written, to the last bit; environment, method and version name it. The
+    hash is the sha256 of the JSON with sorted keys and no spaces, in UTF-8, and numeric keys and tuples are converted
+    to JSON types before."""
+    content = {key: value for key, value in MINE.items() if key != "sha256"}
+    text = json.dumps(content, sort_keys=True, separators=(",", ":"), ensure_ascii=False)
+    assert MINE["sha256"] == hashlib.sha256(text.encode()).hexdigest()
     assert read_records(tmp_path) == [] and read_records(tmp_path / "none") == []
     path = write_record(tmp_path, MINE)
     assert path.name == f"eitbench-Pipe2D-v0--mine--{sha('mine1')[:8]}.json" and MINE["version"] == sha("mine1")[:8]
@@ -50,22 +55,11 @@ def test_round_trip(tmp_path):
     write_record(tmp_path, dict(reversed(MINE.items())))
     assert path.read_bytes() == before and [file.name for file in tmp_path.iterdir()] == [path.name]
     assert before.decode().count("\n") < 40                            # one line for each field, episode and run
-
-
-def test_python_objects_are_written_as_json(tmp_path):
-    """Numeric keys and tuples are converted to JSON types before they are hashed, so that the hash is valid."""
     odd = MINE | {"parameters": {10: (1, 2), 9: None}}
     assert read_record(write_record(tmp_path, odd))["parameters"] == {"10": [1, 2], "9": None}
     for value in (float("nan"), {1, 2}):
         with pytest.raises(ValueError, match="record cannot be written as JSON"):
             write_record(tmp_path, MINE | {"parameters": {"a": value}})
-
-
-def test_the_digest_is_as_the_schema_defines():
-    """The hash is the sha256 of the JSON with sorted keys and no spaces, in UTF-8."""
-    content = {key: value for key, value in MINE.items() if key != "sha256"}
-    text = json.dumps(content, sort_keys=True, separators=(",", ":"), ensure_ascii=False)
-    assert MINE["sha256"] == hashlib.sha256(text.encode()).hexdigest()
 
 
 @pytest.mark.parametrize(("path", "value", "message"), [

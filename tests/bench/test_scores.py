@@ -72,14 +72,6 @@ def test_numbers_by_hand(track, given, expected):
     assert ("spent" in said) == (track == "injection")
 
 
-def test_policies_have_theirs():
-    """Policies have error, injections, time, and scores of the filter's uncertainty if it is available."""
-    said = compute_scores("injection", Outcome(WORLD, 0.5, np.array([0.1, 0.3]), n_injections=7))
-    claims = dict.fromkeys(("nis", "crps", "coverage_50", "coverage_90", "spread_ratio",
-                           "position_error", "lost_fraction", "ospa", "area_error"))
-    assert said == claims | {"error": pytest.approx(0.2), "spent": 7.0, "seconds_per_step": 0.5}
-
-
 WORST = Score("worst_step", "worst", "the worst step", lambda outcome: outcome.errors.max(), factor=100.0)
 
 

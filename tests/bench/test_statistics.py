@@ -117,8 +117,9 @@ def test_exchanged_methods_have_the_negative_difference(statistic):
     assert stratified_bootstrap(plain(one), statistic) == stratified_bootstrap(plain(a), statistic)
 
 
-def test_only_shared_seeds_count():
-    """Scores on other seeds change nothing; environments have equal weights."""
+def test_paired_numbers_by_hand():
+    """Scores on other seeds change nothing; environments have equal weights. Better in 3 of 8 and equal in 2 has the
+    probability (3 + 1)/8, and 1 in the other environment; higher may be better."""
     a = {"pipe": seeded(np.arange(8.0)), "tank": seeded(np.arange(6.0))}
     b = {"pipe": seeded([3.0] * 8)}
     b["tank"] = {seed: score - 2.0 for seed, score in a["tank"].items()}
@@ -127,12 +128,8 @@ def test_only_shared_seeds_count():
     more = {"pipe": a["pipe"] | {"test:99": 1e6}, "tank": {"dev:1": 1e6} | a["tank"]}
     assert paired_difference(more, b) == expected
     assert paired_difference(a, {"pipe": b["pipe"] | {"test:98": -1e6}, "tank": b["tank"]}) == expected
-
-
-def test_paired_probability_of_improvement():
-    """Better in 3 of 8 and equal in 2: (3 + 1)/8, and 1 in the other environment; higher may be better."""
-    a, b = [0, 0, 0, 1, 1, 2, 2, 2], [1, 1, 1, 1, 1, 1, 1, 1]
-    one, other = {"pipe": seeded(a), "tank": seeded([0] * 4)}, {"pipe": seeded(b), "tank": seeded([1] * 4)}
+    one = {"pipe": seeded([0, 0, 0, 1, 1, 2, 2, 2]), "tank": seeded([0] * 4)}
+    other = {"pipe": seeded([1] * 8), "tank": seeded([1] * 4)}
     assert paired_probability_of_improvement(one, other)[0] == 0.75
     assert paired_probability_of_improvement(one, other, higher_is_better=True)[0] == 0.25
     assert paired_probability_of_improvement(one, one) == (0.5, 0.5, 0.5)

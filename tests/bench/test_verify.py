@@ -292,11 +292,8 @@ def test_a_secret_is_private_and_committed():
                                   (b"short", 0o600, "must have 32 bytes, got 5")):
         with pytest.raises(ValueError, match=message):
             read_secret(write_secret(secret, mode))
-    for content in ("words", None):
-        path = Path("words").absolute()
-        path.write_text(content) if content else path.unlink()
-        with pytest.raises(ValueError, match="must be a file of hexadecimal digits"):
-            read_secret(path)
+    with pytest.raises(ValueError, match="must be a file of hexadecimal digits"):
+        read_secret(Path("nothing").absolute())
 
 
 @pytest.mark.parametrize(("gain", "low", "high"), [(0.0, 0.02, 0.08), (0.3, 0.6, 1.0), (-0.3, 0.0, 0.01)])
