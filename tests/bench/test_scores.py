@@ -112,16 +112,12 @@ def test_a_new_score_is_shown_everywhere(apart):
     ({"tracks": ("sprint",)}, "each of tracks must be one of estimation, injection, measured; got 'sprint'"),
     ({"factor": 0.0}, "factor must be")])
 def test_invalid_scores_are_rejected(changes, message, apart):
-    """Nothing is registered."""
+    """Nothing is registered. A score that is not a number is rejected with its name; None is an undefined score."""
     before = list(scores.scores())
     given = {"name": "mine", "heading": "mine", "explanation": "", "compute": lambda outcome: 0.0} | changes
     with pytest.raises(ValueError, match=message):
         register_score(Score(**given))
     assert list(scores.scores()) == before
-
-
-def test_a_score_that_is_not_a_number_is_rejected(apart):
-    """The message has the name; None is an undefined score."""
     register_score(Score("mine", "mine", "", lambda outcome: np.nan))
     with pytest.raises(ValueError, match="score mine"):
         compute_scores("estimation", outcome())

@@ -53,7 +53,6 @@ def test_suites():
     assert set(quick) < set(full)
     assert {job.method for job in full} == set(builtin_methods("estimation")) - real_only
     assert set(parse_seeds(tracks.QUICK_SEEDS)) < set(parse_seeds(entry(PIPE).test_seeds))
-    assert min(parse_seeds(entry(PIPE).test_seeds)) == 200_000
     asked_for = run.make_jobs("estimation", [PIPE], ["gauss_newton"], [1, 2], suite="quick")
     assert [job.seed for job in asked_for] == [1, 2]
 
@@ -127,8 +126,6 @@ def test_documented_commands_are_commands():
     (["run", "--env", "Pipe2D"], "Did you mean eitbench/Pipe2D-v0?"),
     (["run", "--set", "instrument.noise_relativ=0.1"], "Did you mean noise_relative?"),
     (["run", "--baseline", "nowhere.py"], "baseline nowhere.py does not exist"),
-    (["run", "--baseline", "kalman_filter", "--env", "eitbench/Pipe2DSmoothing-v0"],
-     "baseline kalman_filter suits none of the environments"),
     (["leaderboard", "-o", "nothing"], "no results in nothing; create some with `eitbench run`"),
     (["render", "--step", "3"], "out must end in .png with step"),
     (["render", "--baseline", "fixed_interval_smoother"], "not compatible with eitbench/Pipe2D-v0, a filter"),
