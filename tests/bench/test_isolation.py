@@ -283,8 +283,8 @@ FILL = "[open(f'{Path.home()}/{k}', 'wb').write(bytes(2**20)) for k in range(200
 @pytest.mark.parametrize(("update", "limits", "message"), [
     (FORK.format(child="pass"), Limits(threads=100),
      "ResourceLimitError: it started more than 100|RuntimeError: refused"),
-    (FORK.format(child="kept = np.ones(2**25)"), Limits(memory=1 << 30),
-     "ResourceLimitError: it held more than 1024 MiB|MemoryError"),
+    (FORK.format(child="kept = np.ones(2**25)"), Limits(memory=2 << 30),
+     "ResourceLimitError: it held more than 2048 MiB|MemoryError"),
     (FILL, Limits(disk=100 << 20), "No space left"),
 ], ids=["processes", "memory of all processes", "disk"])
 def test_limits_hold_for_all_its_processes(update, limits, message, tmp_path):

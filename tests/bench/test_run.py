@@ -193,7 +193,7 @@ def test_uncertainty_of_sections_and_flow():
     ("Pipe2DUnknownVelocity", "joint_inflow_filter"), ("Pipe2DSmoothing", "inflow_smoother"),
     ("Pipe2DSmoothing", "fixed_interval_smoother"), ("Pipe2DFixedLag", "fixed_lag_smoother"),
     ("Pipe2DSmoothing", "ensemble_smoother"), ("Pipe2DSmoothing", "temporal_regularisation"),
-    ("Pipe2DUnknownVelocity", "joint_extended_kalman_filter")])
+    ("Pipe2DUnknownVelocity", "cross_correlation")])
 def test_joint_covariances_include_the_variances(id, method):
     """The covariance of the concentrations at some nodes is positive definite with their variances on the diagonal."""
     short = {"schedule": {"scored_steps": 6}}

@@ -125,7 +125,6 @@ def test_documented_commands_are_commands():
     (["run", "--seeds", "0-3"], "seeds must have a split: train:0-3, dev:0-3 or test:0-3; got '0-3'"),
     (["run", "--env", "Pipe2D"], "Did you mean eitbench/Pipe2D-v0?"),
     (["run", "--set", "instrument.noise_relativ=0.1"], "Did you mean noise_relative?"),
-    (["run", "--baseline", "nowhere.py"], "baseline nowhere.py does not exist"),
     (["leaderboard", "-o", "nothing"], "no results in nothing; create some with `eitbench run`"),
     (["render", "--step", "3"], "out must end in .png with step"),
     (["render", "--baseline", "fixed_interval_smoother"], "not compatible with eitbench/Pipe2D-v0, a filter"),
