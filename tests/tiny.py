@@ -26,6 +26,24 @@ RUN = {"command": "eitbench run", "blas": "scipy-openblas", "commit": "c0ffee", 
        "versions": {"python": "3.12.1", "eitbench": "0.1.0", "numpy": "2.4.6", "scipy": "1.17.1",
                     "stable-baselines3": None, "torch": None},
        "machine": {"processor": "An abacus", "cores": 2, "system": "Linux", "blas_threads": 1, "matmul_seconds": 0.05}}
+OWN_WORLD = f'''
+from dataclasses import dataclass, replace
+
+from eitbench.worlds import register
+from eitbench.worlds.catalogue import PIPE_2D
+from eitbench.worlds.flows import LaminarFlow
+
+
+@dataclass(frozen=True)
+class Mine(LaminarFlow):
+    """A flow that only this file defines."""
+
+
+world = PIPE_2D.with_changes({FAST!r})
+register(replace(world, name="Mine", flow=Mine(**vars(world.flow))), "mine/Fast-v0")
+'''
+"""Source of a file that registers an id, whose world other processes cannot import."""
+
 MARKS = ("homogeneous", "random_pair", "true_model_smoother")
 """Naive baselines and the oracle."""
 BOARD_IDS = {"filter": "eitbench/Pipe2D-v0", "fixed-lag": "eitbench/Pipe2DFixedLag-v0",

@@ -101,12 +101,9 @@ def test_a_file_is_isolated_on_request(tmp_path):
 
 @pytest.mark.parametrize(("arguments", "message"), [
     ((3, FILTER.id, "dev:0"), r"method must be a class with update\(voltages, currents\), or the name"),
-    ((int, FILTER.id, "dev:0"), r"baseline int: int must have a method update\(voltages, currents\)"),
     ((Level, FILTER.id, []), "seeds must name at least one episode"),
     ((Level, FILTER.id, [-1]), "seeds must be an integer of at least 0, got -1"),
-    ((Level, "eitbench/Pipe-v0", "dev:0"), "env must be one of"),
-    ((Level, 3, "dev:0"), "env must be an id, or made by gymnasium.make, got int"),
-    (("nobody", FILTER.id, "dev:0"), "baseline")])
+    ((Level, 3, "dev:0"), "env must be an id, or made by gymnasium.make, got int")])
 def test_mistakes_are_explained(arguments, message):
     with pytest.raises(ValueError, match=message):
         eitbench.evaluate(*arguments)

@@ -74,12 +74,11 @@ def write_fields(folder):
 
 @pytest.mark.parametrize(("environment", "kind", "write"), [
     (FIXED_LAG, "process", write_fields), (INJECTION, ISOLATION, write_policy),
-    (FILTER, ISOLATION, lambda _: "homogeneous"), (FILTER, "process", lambda _: "log_inflow_filter")],
-    ids=["lag", "injection", "built-in", "joint covariance"])
+    (FILTER, ISOLATION, lambda _: "log_inflow_filter")], ids=["lag", "injection", "built-in"])
 def test_scores_are_identical(environment, kind, write, tmp_path, monkeypatch):
-    """Test an estimator that reports every field, a policy that depends on its random numbers, and
-    a built-in method by name; one worker runs both episodes. The state of a policy's generator,
-    which is sent, does not reveal the seed."""
+    """Test an estimator that reports every field, a policy that depends on its random numbers, and a built-in method
+    with a joint covariance by name; one worker runs both episodes. The state of a policy's generator, which is sent,
+    does not reveal the seed."""
     sent = []
     encode = isolation.encode_message
     monkeypatch.setattr(isolation, "encode_message", lambda content: sent.append(content) or encode(content))
@@ -372,10 +371,8 @@ VALID = {"title": "Mine", "subtracks": ["filter"], "role": None, "privileged": F
 
 
 @pytest.mark.parametrize(("changes", "message"), [
-    ({"title": "a\x1b[2J"}, "reports an invalid title"), ({"title": None}, "reports an invalid title"),
-    ({"subtracks": [{}]}, "subtracks must be some of"), ({"role": []}, "role must be among"),
-    ({"parameters": {"a": "b" * 10_000}}, "parameters must have at most"), ({"privileged": True}, "is privileged"),
-    ({"name": "homogeneous"}, "")])
+    ({"title": "a\x1b[2J"}, "reports an invalid title"), ({"subtracks": [{}]}, "subtracks must be some of"),
+    ({"privileged": True}, "is privileged"), ({"name": "homogeneous"}, "")])
 def test_forged_attributes_are_rejected(changes, message, tmp_path, monkeypatch):
     """A worker may report anything, but does not choose its name, under which results are stored."""
     monkeypatch.setattr(Worker, "start", lambda self: self.about.update(VALID | changes))
@@ -389,7 +386,7 @@ def test_forged_attributes_are_rejected(changes, message, tmp_path, monkeypatch)
 
 
 @pytest.mark.parametrize(("content", "message"), [
-    ("class Estimator: pass", "Estimator must have a method update"), ("import os; os._exit(4)", "ended with status 4"),
+    ("import os; os._exit(4)", "ended with status 4"),
     ("import os\nfrom eitbench.bench.isolation import encode_message\nos.write(4, encode_message({'title': 7}))",
      "reports an invalid title")])
 def test_files_that_cannot_be_loaded_are_named(content, message, tmp_path):
@@ -420,12 +417,10 @@ def test_messages_arrive(content):
 
 
 @pytest.mark.parametrize(("head", "body"), [
-    (b"nonsense", b""), (b"[1, []]", b""), (b"[{}, 7]", b""), (b"[{}, [7]]", b""), (b"[{}, []]", b"\0"),
-    (b'[{"a": NaN}, []]', b""), (b'[{"a": "\\ud800"}, []]', b""), (b"[" * 100_000, b""),
-    (b'[{"a": ' + b"[" * 30 + b"]" * 30 + b"}, []]", b""), (b'[{"a": ' + b"9" * 5000 + b"}, []]", b""),
+    (b"nonsense", b""), (b"[1, []]", b""), (b"[{}, [7]]", b""), (b"[{}, []]", b"\0"), (b'[{"a": NaN}, []]', b""),
+    (b'[{"a": "\\ud800"}, []]', b""), (b"[" * 100_000, b""), (b'[{"a": ' + b"[" * 30 + b"]" * 30 + b"}, []]", b""),
     (b'[{}, [["a", "<f8", [2]]]]', b"\0" * 8), (b'[{}, [["a", "<f8", [-1]]]]', b"\0" * 8),
-    (b'[{}, [["a", "O", [1]]]]', b"\0" * 8), (b'[{}, [["a", ",f8", [1]]]]', b"\0" * 8),
-    (b'[{}, [["a", {"a": 1}, [1]]]]', b""), (b'[{}, [["a", "<f8", [0, true]]]]', b""),
+    (b'[{}, [["a", "O", [1]]]]', b"\0" * 8), (b'[{}, [["a", {"a": 1}, [1]]]]', b""),
     (b'[{}, [["a", "<f8", [0, 18446744073709551616]]]]', b""),
     (b'[{}, [["a", "<f8", ' + b"[1" + b", 1" * 80 + b"]]]]", b"\0" * 8),
 ])
@@ -436,8 +431,7 @@ def test_malformed_messages_are_rejected(head, body):
         isolation.decode_message(content.read)
 
 
-@pytest.mark.parametrize("lengths", [(isolation.MAX_HEADER_BYTES + 1, 0),
-                                     (0, isolation.MAX_ARRAY_BYTES + 1)])
+@pytest.mark.parametrize("lengths", [(isolation.MAX_HEADER_BYTES + 1, 0), (0, isolation.MAX_ARRAY_BYTES + 1)])
 def test_long_messages_are_not_read(lengths):
     """Lengths are checked before anything else is read."""
     readable = iter([struct.pack("<QQ", *lengths)])

@@ -55,19 +55,14 @@ def test_the_policy_has_the_same_random_stream_as_in_runs():
     np.testing.assert_allclose(played, env.rules.currents(episode.actions))
 
 
-@pytest.mark.parametrize(("given", "said"), [
-    ({"name": "a b"}, "out must be the name of a Minari data set"),
-    ({"env": "eitbench/Pipe2D-v0"}, "is not of the track injection"),
-    ({"policy": "nobody"}, "nobody"),
-    ({"seeds": "200003"}, "must name the split of test episodes"),
-])
-def test_mistakes(given, said, tmp_path):
-    with pytest.raises(ValueError, match=said):
-        export_minari(**{"name": NAME, "env": ENV, "policy": "random_pair", "seeds": "train:0"} | given)
+def test_command_and_mistakes(tmp_path):
+    """Mistakes are named before any episode is run; a data set is not replaced."""
+    for given, said in (({"name": "a b"}, "out must be the name of a Minari data set"),
+                        ({"env": "eitbench/Pipe2D-v0"}, "is not of the track injection"),
+                        ({"seeds": "200003"}, "must name the split of test episodes")):
+        with pytest.raises(ValueError, match=said):
+            export_minari(**{"name": NAME, "env": ENV, "policy": "random_pair", "seeds": "train:0"} | given)
     assert not list(tmp_path.iterdir())
-
-
-def test_command_and_existing_name():
     line = ["export", "--format", "minari", "--env", ENV, "--seeds", "train:0", "--out", NAME, "-j", "1"]
     code, _, complaint = eitbench(*line)
     assert code == 2 and "policy must be given with format minari" in complaint

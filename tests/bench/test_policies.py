@@ -11,7 +11,7 @@ from eitbench import scoring
 from eitbench.bench import runner
 from eitbench.bench.methods import builtin_methods, load_method
 from eitbench.bench.run import Job, run_jobs
-from eitbench.bench.scores import Outcome, compute_scores
+from eitbench.bench.scores import compute_scores
 from eitbench.bench.store import EpisodeStore
 from eitbench.bench.tracks import Environment
 from eitbench.data.episode_cache import mass_between, truth_mesh
@@ -48,13 +48,18 @@ def environment(name: str) -> InjectionEnv:
 
 @pytest.mark.parametrize("name", [NAME, INFLOW, FAULTS, BUDGET, FLOW])
 def test_belief_is_the_filter_inside(name):
-    """A belief that a policy updates equals the environment's reduced filter, to the bit."""
+    """A belief that a policy updates equals the environment's reduced filter, to the bit. A pair's action injects its
+    currents."""
     env = environment(name)
     observation, _ = env.reset(seed=SEED)
     belief = Belief(env.rules, observation)
     for pair in (7, 100, None if env.rules.budget else 3, 7):
         belief.predict_covariance()                                      # changes nothing
         observation, *_ = env.step(env.rules.action(pair))
+        expected = np.zeros(16)
+        if pair is not None:
+            expected[env.rules.pairs[pair]] = env.rules.amplitude, -env.rules.amplitude
+        np.testing.assert_allclose(observation["currents"], expected)
         belief.update(observation)
         inside = filter_of(env)
         np.testing.assert_array_equal(belief.mean, inside.means()[0])
@@ -114,22 +119,6 @@ def test_the_prior_belief_is_the_expected_concentration():
     about_c_ref = belief.linearisation.jacobian
     np.testing.assert_allclose(belief.relinearised_jacobian(), about_c_ref, rtol=0.1,
                                atol=0.02 * np.abs(about_c_ref).max())
-
-
-@pytest.mark.parametrize("name", list(KWARGS))
-def test_the_action_of_a_pair_injects_it(name):
-    """A pair's action injects its currents in every world; the action without injection has no current."""
-    rules = environment(name).rules
-    action = rules.action(21)
-    assert rules.action_space.contains(np.int64(action) if rules.limit is None else action)
-    expected = np.zeros((1, 16))
-    expected[0, rules.pairs[21]] = rules.amplitude, -rules.amplitude
-    np.testing.assert_allclose(rules.currents(np.array([action])), expected, rtol=1e-6)
-    if rules.limit is None and rules.budget is None:
-        with pytest.raises(ValueError, match="pair must be a number in a world without a budget, got None"):
-            rules.action(None)
-    else:
-        assert not rules.currents(np.array([rules.action(None)])).any()
 
 
 @pytest.mark.parametrize("budget", [0, 1, 7, 30, 182, 500])
@@ -217,11 +206,10 @@ def test_finished_and_failed_episodes_are_stored(tmp_path):
     todo = [Job(reduced, policy, seed) for policy in ("random_pair", "adjacent", bad)
             for seed in parse_seeds("dev:1,0")]
     run_jobs(todo, store, command="eitbench run")
-    rows = policy_rows(todo, store.results())
-    assert sorted(zip(rows["policy"], rows["seed"], strict=True)) == [
-        (policy, seed) for policy in ("adjacent", "random_pair") for seed in ("dev:0", "dev:1")]
+    errors = policy_rows(todo, store.results()).set_index(["policy", "seed"])["error"]
+    assert sorted(errors.index) == [(policy, f"dev:{k}") for policy in ("adjacent", "random_pair") for k in (0, 1)]
     played = injected(NAME, SHORT, "adjacent", parse_seeds("dev:0")[0], "reduced")
-    assert rows.set_index(["policy", "seed"])["error"]["adjacent", "dev:0"] == played.errors.mean()
+    assert errors["adjacent", "dev:0"] == played.errors.mean()
     record, failed, floor = store.write_records()
     assert (record["board"], record["method"], record["seeds"]) == ("injection", "adjacent", ["dev:0", "dev:1"])
     assert record["environment"]["kwargs"]["estimator"] == "reduced"
@@ -245,17 +233,15 @@ def test_errors_of_policies_are_ordered_and_pool_trainings():
     assert gap_text(rows[rows["policy"] == "random_pair"]) == ""
 
 
-def test_unknown_names_are_reported(tmp_path):
-    """Unknown policies, environments and estimators are reported, and a file without a policy."""
+@pytest.mark.parametrize(("name", "policy", "estimator", "message"), [
+    (NAME, "mine.py", "full", r"mine\.py: Policy must have a method act\(observ"),
+    ("eitbench/Pipe2D-v0", "adjacent", "full", "environment eitbench/Pipe2D-v0 is not of the track inj"),
+    (NAME, "adjacent", "none", "estimator must be one of full, reduced; got 'none'")])
+def test_mistakes_are_explained(name, policy, estimator, message, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
     (tmp_path / "mine.py").write_text("class Policy: pass")
-    (tmp_path / "greedy_a.zip").write_bytes(b"PK")
-    for name, kwargs, policy, estimator, message in (
-            (NAME, SHORT, str(tmp_path / "mine.py"), "full", r"mine\.py: Policy must have a method act\(observ"),
-            (NAME, SHORT, str(tmp_path / "greedy_a.zip"), "full", r"greedy_a\.zip has the name of a built-in method"),
-            ("eitbench/Pipe2D-v0", {}, "adjacent", "full", "environment eitbench/Pipe2D-v0 is not of the track inj"),
-            (NAME, SHORT, "adjacent", "none", "estimator must be one of full, reduced; got 'none'")):
-        with pytest.raises(ValueError, match=message):
-            injected(name, kwargs, policy, 1, estimator)
+    with pytest.raises(ValueError, match=message):
+        injected(name, {}, policy, 1, estimator)
 
 
 def hand_made(**errors: list[float]) -> pd.DataFrame:
@@ -276,31 +262,21 @@ def test_adaptivity_gap_is_the_formula():
             adaptivity_gap(pd.concat([table, hand_made(c=[2.0])]), incomplete)
 
 
-def test_attained_fraction_compares_with_the_oracle():
-    """The mean errors are 4, 2 and 1."""
+def test_ratios_compare_means():
+    """The mean errors are 4, 2 and 1: the fraction of the oracle's gain is 2/3. Of each kind the best policy counts,
+    without oracles and random pairs. For policies with the score of a body the text has the ratio of mean squares."""
     table = hand_made(best_cycle=[2.0, 4.0, 6.0], greedy_a=[1.0, 3.0, 2.0], one_step_oracle=[1.0, 1.0, 1.0])
     fraction = attained_fraction(table, "greedy_a", "best_cycle", "one_step_oracle")
     assert fraction == (pytest.approx(2.0 / 3.0), -np.inf, np.inf)
     assert "(best_cycle − greedy_a) / (best_cycle − one_step_oracle): 0.67" in gap_text(table.assign(ospa=None))
-    with pytest.raises(KeyError):
-        attained_fraction(table, "greedy_a", "best_cycle", "attainable_oracle")
-
-
-def test_adaptive_ratio_is_the_ratio_of_means():
-    """The best policy of each kind counts, without oracles and random pairs."""
     table = hand_made(clairvoyant=[0.1] * 9, random_pair=[0.2] * 9, best_cycle=[2.0, 4.0] * 4 + [3.0],
                       best_pair=[5.0] * 9, mine=[1.0, 2.0] * 4 + [1.5], other=[4.0] * 9)
     assert adaptive_ratio(table) == ("mine", "best_cycle", *[pytest.approx(0.5)] * 3)
-    with pytest.raises(ValueError, match="rows must hold an adaptive and an open-loop policy"):
-        adaptive_ratio(hand_made(random_pair=[1.0], best_pair=[2.0]))
-
-
-def test_the_text_has_the_ratio_of_mean_squared_ospa():
-    """It is given for policies with the score of a body."""
-    table = hand_made(mine=[1.0] * 9, best_cycle=[2.0] * 9)
     assert "OSPA" not in gap_text(table.assign(ospa=None))
     found = gap_text(table.assign(ospa=2.0 * table["error"]))
     assert "mean squared OSPA of mine / best_cycle: 0.25 (95 % interval 0.25 to 0.25)" in found
+    with pytest.raises(ValueError, match="rows must hold an adaptive and an open-loop policy"):
+        adaptive_ratio(hand_made(random_pair=[1.0], best_pair=[2.0]))
 
 
 def test_the_interval_of_the_adaptivity_gap_is_student_s():
@@ -361,13 +337,6 @@ def test_uncertainty_is_of_the_filter_inside_the_environment(name):
                 "spread_ratio": scoring.spread_ratio(*claim)}
     assert {key: said[key] for key in expected} == pytest.approx(expected, rel=1e-9)
     assert 0.0 < said["crps"] < env.world.expected_concentration
-
-
-def test_only_accepted_measurements_count():
-    """Two accepted measurements and then one: (4/1 + 4/4)/2 = 2.5 and 9/1 = 9 have the mean 5.75."""
-    innovations = ([np.array([2.0, 2.0]), np.array([3.0])], [np.diag([1.0, 4.0]), np.eye(1)])
-    outcome = Outcome(entry(NAME).world, 0.0, np.ones(2), innovations=innovations)
-    assert compute_scores("injection", outcome)["nis"] == pytest.approx(5.75)
 
 
 def test_policies_do_not_observe_scored_quantities():

@@ -40,7 +40,12 @@ def changed(path, value, whole=MINE):
 
 
 def test_round_trip(tmp_path):
-    """The file that is read equals what was written, to the last bit; environment, method and version name it."""
+    """The file that is read equals what was written, to the last bit; environment, method and version name it. The
+    hash is the sha256 of the JSON with sorted keys and no spaces, in UTF-8, and numeric keys and tuples are converted
+    to JSON types before."""
+    content = {key: value for key, value in MINE.items() if key != "sha256"}
+    text = json.dumps(content, sort_keys=True, separators=(",", ":"), ensure_ascii=False)
+    assert MINE["sha256"] == hashlib.sha256(text.encode()).hexdigest()
     assert read_records(tmp_path) == [] and read_records(tmp_path / "none") == []
     path = write_record(tmp_path, MINE)
     assert path.name == f"eitbench-Pipe2D-v0--mine--{sha('mine1')[:8]}.json" and MINE["version"] == sha("mine1")[:8]
@@ -50,20 +55,6 @@ def test_round_trip(tmp_path):
     write_record(tmp_path, dict(reversed(MINE.items())))
     assert path.read_bytes() == before and [file.name for file in tmp_path.iterdir()] == [path.name]
     assert before.decode().count("\n") < 40                            # one line for each field, episode and run
-
-
-def test_versions_and_splits_have_separate_files(tmp_path):
-    """Other versions of the method, or other seeds, do not replace a record; runs with other library versions do."""
-    other_code = RUN | {"source": sha("newer")}
-    for each in (MINE, record("mine", [0.1], version="2"), record("mine", [0.1], version="v1"),
-                 record("mine", {"dev:0": 0.1}), record("mine", [0.3], runs=[other_code])):
-        write_record(tmp_path, each)
-    assert len(read_records(tmp_path)) == 4
-    assert MINE not in read_records(tmp_path)
-
-
-def test_python_objects_are_written_as_json(tmp_path):
-    """Numeric keys and tuples are converted to JSON types before they are hashed, so that the hash is valid."""
     odd = MINE | {"parameters": {10: (1, 2), 9: None}}
     assert read_record(write_record(tmp_path, odd))["parameters"] == {"10": [1, 2], "9": None}
     for value in (float("nan"), {1, 2}):
@@ -71,43 +62,25 @@ def test_python_objects_are_written_as_json(tmp_path):
             write_record(tmp_path, MINE | {"parameters": {"a": value}})
 
 
-def test_the_digest_is_as_the_schema_defines():
-    """The hash is the sha256 of the JSON with sorted keys and no spaces, in UTF-8."""
-    content = {key: value for key, value in MINE.items() if key != "sha256"}
-    text = json.dumps(content, sort_keys=True, separators=(",", ":"), ensure_ascii=False)
-    assert MINE["sha256"] == hashlib.sha256(text.encode()).hexdigest()
-
-
 @pytest.mark.parametrize(("path", "value", "message"), [
     ("schema", 1, r"\$\.schema: 3 was expected"),
-    ("version", "1", r'\$\.version: "1" does not match'),
     ("version", "deadbeef", r"\$\.version: must be v1, v2, … or the first eight digits of method_sha256"),
-    ("version", ..., '"version" is a required property'),
-    ("title", "Fine |\n| 1 | Forged |", r"\$\.title: "),
     ("title", "a\u202eb", r"\$\.title: .* is not allowed"),
     ("board", "smooth", r'\$\.board: "smooth" is not one of'),
-    ("role", "best", r'\$\.role: "best" is not one of'),
-    ("official", "no", r'\$\.official: "no" is not of type "boolean"'),
     ("method", "../mine", r'\$\.method: "../mine" does not match'),
     ("score", 1, "'score' was unexpected"),
     ("episodes.1.step_errors", [0.25, 0.25], r"\$\.episodes: must have the same number of step_errors each"),
     ("checkpoint_sha256", "a" * 64 + "\n", r"\$\.checkpoint_sha256: "),           # Python's $ matches before a line end
     ("episodes.0.scores.nis", 1e51, r"\$\.episodes\[0\]\.scores\.nis: 1e\+51 is greater than the maximum"),
-    ("episodes.0.scores.nis", 1e-101, r"\$\.episodes\[0\]\.scores\.nis: .* is not allowed for 1e-101"),
     ("environment.kwargs", {"lag": 3}, r"\$\.environment\.name: must be eitbench-Pipe2D-v0-\w{8}, as id and"),
     ("environment.kwargs", {"scenario": 10_000 * "x"}, r"\$\.environment\.kwargs: must have 10000 characters at most"),
     ("runs.0.commit", ..., r'\$\.runs\[0\]: "commit" is a required property'),
-    ("runs.0.isolation", "jail", r'\$\.runs\[0\]\.isolation: "jail" is not one of'),
-    ("episodes.0.scores.error", -1.0, r"\$\.episodes\[0\]\.scores\.error: -1.0 is less than the minimum"),
     ("episodes.0.scores.error", 0.05, r"\$\.episodes\[0\]\.scores\.error: must be the mean of step_errors"),
-    ("episodes.0.scores.Beauty", 1.0, r"\$\.episodes\[0\]\.scores: Additional properties are not allowed \('Beauty'"),
     ("episodes.2.message", ..., r'\$\.episodes\[2\]: "message" is a required property'),
     ("episodes.2.scores", {"error": 0.1, "seconds_per_step": 0.1}, r"\$\.episodes\[2\]\.scores: "),
-    ("episodes.1.finished", "yesterday", r'\$\.episodes\[1\]\.finished: "yesterday" does not match'),
     ("episodes.1.run", 1, r"\$\.episodes\[1\]\.run: there are only 1 runs"),
     ("episodes.1.seed", "test:0", r"\$\.seeds: must be the seeds of the episodes"),
     ("seeds", ["test:0", "dev:1", "test:2"], r"\$\.seeds: must all be of the split test"),
-    ("seeds", ["test:0", "test:0", "test:2"], r'\$\.seeds: \["test:0","test:0","test:2"\] has non-unique elements'),
 ])
 def test_violations_are_named(path, value, message, tmp_path):
     """A record that breaks the format is neither written nor read; the message has the file and the field."""
@@ -195,9 +168,8 @@ TOO_LONG = entry(PIPE).world.n_steps - 1
 
 
 @pytest.mark.parametrize(("id", "kwargs", "board"), [
-    (PIPE, {}, "filter"), (PIPE, {"lag": 0}, "filter"), (PIPE, {"lag": 3}, "fixed-lag"), (LATER, {}, "fixed-lag"),
-    (PIPE, {"lag": TOO_LONG}, "smoothing"), (LONG, {}, "smoothing"), (LONG, {"lag": 0}, "filter"),
-    (LONG, {"lag": None}, "smoothing"), (PIPE, {"lag": "all", "world": {"flow": {}}}, "smoothing"),
+    (PIPE, {}, "filter"), (LATER, {}, "fixed-lag"), (PIPE, {"lag": TOO_LONG}, "smoothing"),
+    (LONG, {"lag": 0}, "filter"), (LONG, {"lag": None}, "smoothing"), (PIPE, {"lag": "all"}, "smoothing"),
     (PIPE, {"lag": 2, "world": {"schedule": {"scored_steps": 9}}}, "fixed-lag"),
     ("eitbench/Pipe2DInjection-v0", {"gate": 3.0}, "injection")])
 def test_the_environment_determines_the_subtrack(id, kwargs, board, tmp_path):
@@ -213,16 +185,15 @@ def test_the_environment_determines_the_subtrack(id, kwargs, board, tmp_path):
 
 
 @pytest.mark.parametrize(("kwargs", "message"), [
-    ({"scenario": 5}, "argument of .*got 'scenario'"), ({"world": 5}, "world"), ({"world": [1]}, "world"),
-    ({"assume": "all"}, "assume must be a dict"), ({"lag": -1}, "lag must be"), ({"lag": 1.5}, "lag must be"),
-    ({"lag": True}, "lag must be"), ({"lag": "some"}, "lag must be"), ({"lag": {}}, "lag must be")])
+    ({"scenario": 5}, "argument of .*got 'scenario'"), ({"world": [1]}, "world"),
+    ({"assume": "all"}, "assume must be a dict"), ({"lag": -1}, "lag must be"), ({"lag": {}}, "lag must be")])
 def test_unknown_arguments_are_rejected(kwargs, message, tmp_path):
     environment = {"id": PIPE, "name": environment_name(PIPE, kwargs), "kwargs": kwargs}
     with pytest.raises(ValueError, match=rf"\$\.environment\.kwargs: .*{message}"):
         write_record(tmp_path, record("mine", [0.1], environment=environment))
 
 
-@pytest.mark.parametrize("text", ["1e999", "-1e999", "NaN", "Infinity", "9" * 400, "9" * 5000, '"\\ud800"',
+@pytest.mark.parametrize("text", ["1e999", "NaN", "9" * 400, '"\\ud800"',
                                   "[" * MAX_RECORD_DEPTH + "]" * MAX_RECORD_DEPTH, "[" * 50_000 + "]" * 50_000])
 @pytest.mark.parametrize("place", ['"parameters": {"a": 7}', '"seconds": 7', '"error": 7'])
 def test_values_that_json_lacks_are_reported_with_the_file(text, place, tmp_path):
@@ -246,11 +217,3 @@ def test_large_and_special_files_are_not_opened(tmp_path):
         with pytest.raises(ValueError, match=r"it\.json cannot be read: it must be a file of at most 8 MiB"):
             read_record(path)
         path.rmdir() if path.is_dir() else path.unlink()
-
-
-@pytest.mark.parametrize("content", [b"", b"{", b"\xff\xfe", b"[]", b"null", b'{"schema": NaN}'])
-def test_files_that_are_not_records_are_rejected(content, tmp_path):
-    """Unlike a run's episodes, published records must all be valid."""
-    (tmp_path / "it.json").write_bytes(content)
-    with pytest.raises(ValueError, match=r"record .*it\.json (cannot be read|is not valid)"):
-        read_records(tmp_path)

@@ -117,8 +117,9 @@ def test_exchanged_methods_have_the_negative_difference(statistic):
     assert stratified_bootstrap(plain(one), statistic) == stratified_bootstrap(plain(a), statistic)
 
 
-def test_only_shared_seeds_count():
-    """Scores on other seeds change nothing; environments have equal weights."""
+def test_paired_numbers_by_hand():
+    """Scores on other seeds change nothing; environments have equal weights. Better in 3 of 8 and equal in 2 has the
+    probability (3 + 1)/8, and 1 in the other environment; higher may be better."""
     a = {"pipe": seeded(np.arange(8.0)), "tank": seeded(np.arange(6.0))}
     b = {"pipe": seeded([3.0] * 8)}
     b["tank"] = {seed: score - 2.0 for seed, score in a["tank"].items()}
@@ -127,12 +128,8 @@ def test_only_shared_seeds_count():
     more = {"pipe": a["pipe"] | {"test:99": 1e6}, "tank": {"dev:1": 1e6} | a["tank"]}
     assert paired_difference(more, b) == expected
     assert paired_difference(a, {"pipe": b["pipe"] | {"test:98": -1e6}, "tank": b["tank"]}) == expected
-
-
-def test_paired_probability_of_improvement():
-    """Better in 3 of 8 and equal in 2: (3 + 1)/8, and 1 in the other environment; higher may be better."""
-    a, b = [0, 0, 0, 1, 1, 2, 2, 2], [1, 1, 1, 1, 1, 1, 1, 1]
-    one, other = {"pipe": seeded(a), "tank": seeded([0] * 4)}, {"pipe": seeded(b), "tank": seeded([1] * 4)}
+    one = {"pipe": seeded([0, 0, 0, 1, 1, 2, 2, 2]), "tank": seeded([0] * 4)}
+    other = {"pipe": seeded([1] * 8), "tank": seeded([1] * 4)}
     assert paired_probability_of_improvement(one, other)[0] == 0.75
     assert paired_probability_of_improvement(one, other, higher_is_better=True)[0] == 0.25
     assert paired_probability_of_improvement(one, one) == (0.5, 0.5, 0.5)
@@ -146,32 +143,18 @@ def board(**methods):
     return {method: {"pipe": seeded(scores)} for method, scores in methods.items()}
 
 
-ONE = np.ones(12)
-PIPE_AND_TANK = {"b": {"pipe": seeded(np.ones(6)), "tank": seeded(np.zeros(60))},
-                 "a": {"pipe": seeded(np.zeros(6)), "tank": seeded(np.full(60, 0.5))}}
-
-
 @pytest.mark.parametrize(("scores", "how", "expected"), [
     # each worse than the one before on every episode, best first; higher may be better
     (board(c=NOISE + 3, a=NOISE + 1, b=NOISE + 2), {}, {"a": 1, "b": 2, "c": 3}),
     (board(c=NOISE + 3, a=NOISE + 1, b=NOISE + 2), {"higher_is_better": True}, {"c": 1, "b": 2, "a": 3}),
-    # two methods without a significant difference share rank 1, and the third is worse than both; equal scores share
-    (board(last=10 * ONE, a=0.1 * NOISE, b=0.01 - 0.1 * NOISE), {}, {"a": 1, "b": 1, "last": 3}),
-    (board(c=NOISE + 1, b=NOISE, a=NOISE), {}, {"a": 1, "b": 1, "c": 3}),
     (board(a=NOISE), {}, {"a": 1}), ({}, {}, {}),
     # a difference by rounding in every episode
-    (board(a=ONE, b=(1.0 + 1e-12) * ONE), {}, {"a": 1, "b": 1}),
-    # intervals of the scores overlap widely, but one is slightly better on every episode
-    (board(a=100 * NOISE, b=100 * NOISE + 0.5), {}, {"a": 1, "b": 2}),
+    (board(a=np.ones(12), b=np.full(12, 1.0 + 1e-12)), {}, {"a": 1, "b": 1}),
     # not transitive: no significant difference of a and b, nor of b and c, but a is better than c
-    (board(a=0 * NOISE, b=0.5 + 1.5 * NOISE, c=ONE), {}, {"a": 1, "b": 1, "c": 2}),
-    # a method with large variance has a worse mean than a method of rank 2, and no significant difference
-    (board(a=0 * NOISE, b=0.1 * ONE, c=0.5 + 3 * NOISE), {}, {"a": 1, "b": 2, "c": 1}),
+    (board(a=0 * NOISE, b=0.5 + 1.5 * NOISE, c=np.ones(12)), {}, {"a": 1, "b": 1, "c": 2}),
     # a single outlier affects the mean, and not the interquartile mean
     (board(a=np.zeros(24), b=np.r_[np.full(23, -1.0), 100.0]), {}, {"a": 1, "b": 1}),
     (board(a=np.zeros(24), b=np.r_[np.full(23, -1.0), 100.0]), {"statistic": interquartile_mean}, {"b": 1, "a": 2}),
-    # equal weights of environments: better by 1 in 6 episodes, worse by 0.5 in 60
-    (PIPE_AND_TANK, {}, {"a": 1, "b": 2}),
     # four better episodes are not significant: for equal methods the probability is 1/8
     (board(a=NOISE[:4], b=NOISE[:4] + 1), {}, {"a": 1, "b": 1})])
 def test_shared_ranks(scores, how, expected):
@@ -210,19 +193,13 @@ def test_ranks_agree_with_the_definition(statistic, higher):
 
 @pytest.mark.parametrize(("call", "message"), [
     (lambda: interquartile_mean(), "scores must hold"),
-    (lambda: mean_over_environments([1.0], []), "scores must hold"),
     (lambda: stratified_bootstrap({"pipe": NOISE}, np.mean), "statistic must reduce the last axis only"),
     (lambda: stratified_bootstrap({"pipe": NOISE}, interquartile_mean, n_resamples=0), "n_resamples must be"),
-    (lambda: stratified_bootstrap({}, interquartile_mean), "scores must be finite"),
-    (lambda: stratified_bootstrap({"pipe": np.ones((3, 3))}, interquartile_mean), "scores must be finite"),
     (lambda: stratified_bootstrap({"pipe": [1.0, math.nan]}, interquartile_mean), "scores must be finite"),
     (lambda: paired_difference({"pipe": seeded(NOISE)}, {"pipe": seeded(NOISE, "dev")}), "compared methods share"),
     (lambda: paired_difference({"pipe": seeded(NOISE)}, {"tank": seeded(NOISE)}), "environments must .* pipe and tank"),
-    (lambda: paired_difference({}, {}), "scores must be finite"),
-    (lambda: paired_difference({"pipe": {"a": math.inf}}, {"pipe": {"a": math.inf}}), "scores must be finite"),
     (lambda: shared_ranks(board(a=NOISE) | {"b": {"tank": seeded(NOISE)}}), "environments must be the same"),
     (lambda: shared_ranks(board(a=NOISE, b=NOISE[:7])), "must be of the same episodes, got others of a"),
-    (lambda: shared_ranks({"a": {"pipe": {}}}), "scores must be finite"),
 ])
 def test_errors_name_the_argument(call, message):
     with pytest.raises(ValueError, match=message):

@@ -69,10 +69,18 @@ def test_a_file_that_cannot_be_executed_says_where(tmp_path):
 
 
 def test_the_table_has_the_requested_results_and_fits(tmp_path):
-    """Other results in the folder are not shown; 80 columns or the width of the terminal; every score is a number."""
+    """Other results in the folder are not shown; 80 columns or the width of the terminal; every score is a number.
+    `leaderboard` writes the same again, from the stored episodes only."""
     for name in ("first", "second_" + 40 * "x"):
         write_baseline(tmp_path, name, update="return Estimate(self.level, np.ones_like(self.level))")
-    run("--baseline", "first.py", "--isolate", "none")
+    _, said, _ = run("--baseline", "first.py", "--isolate", "none")
+    results = [tmp_path / "results" / name for name in ("leaderboard.md", "index.html")]
+    before = [path.read_text(encoding="utf-8") for path in results]
+    assert all("Mine" in text for text in before) and "wrote results/index.html" in said
+    for path in results:
+        path.unlink()
+    assert commands.run("leaderboard")[:2] == (0, said)
+    assert [path.read_text(encoding="utf-8") for path in results] == before
     _, said, _ = run("--baseline", f"second_{40 * 'x'}.py", "--baseline", "homogeneous", "--isolate", "none")
     lines = [line for line in said.splitlines() if line.startswith("|")]
     assert len(lines) == 4 and {len(line) for line in lines} == {len(lines[0])} and len(lines[0]) <= 80
@@ -105,7 +113,6 @@ def test_a_sweep_has_a_table_and_a_chart(tmp_path):
     ([], [{}]),
     (["a.b=0.1"], [{"a": {"b": 0.1}}]),
     (["a.b=1,2", "a.c=[1, 2]"], [{"a": {"b": 1, "c": [1, 2]}}, {"a": {"b": 2, "c": [1, 2]}}]),
-    (["a.b=x,null"], [{"a": {"b": "x"}}, {"a": {"b": None}}]),
     (["a.b=1,2", "c=3,4"], [{"a": {"b": i}, "c": j} for i in (1, 2) for j in (3, 4)]),
 ])
 def test_variants(settings, worlds):
@@ -117,10 +124,8 @@ def test_variants(settings, worlds):
 
 @pytest.mark.parametrize(("settings", "message"), [
     (["noise"], "set must look like 'instrument.noise_relative=0.02'"),
-    (["a..b=1"], "set must look like"),
     (["a.b="], "set must look like"),
     (["a.b=1,"], "set must give different values, none of them empty, got 'a.b=1,'"),
-    (["a.b=1,2,1"], "set must give different values"),
     (["a.b=1", "a.b=2"], "set must name each number once, got 'a.b' again"),
     (["a.b=1", "a=2"], "set must name each number once, got 'a' again"),
 ])
