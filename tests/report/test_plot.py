@@ -82,7 +82,7 @@ def test_an_episode_shows_truth_and_estimate():
     assert min(told) < 2 * errors and max(told) > errors / 2
 
 
-def test_an_episode_of_a_policy():
+def test_an_episode_of_a_policy(tmp_path):
     axes = eitbench.plot.episode("random_pair", INJECTION, 3, world=world(INJECTION)["world"], times=1)
     assert axes.shape == (1, 2) and "random_pair, ẽ_c =" in axes[0, 1].get_title()
     for method, seed, times, message in [
@@ -91,6 +91,8 @@ def test_an_episode_of_a_policy():
             ("homogeneous", "dev:0-1", 1, "seed must name one episode, .*, got 'dev:0-1'")]:
         with pytest.raises(ValueError, match=message):
             eitbench.plot.episode(method, PIPE, seed, world=world(PIPE)["world"], times=times)
+    with pytest.raises(ValueError, match=f"policy must be one for {INJECTION}, got a, b"):
+        animate(INJECTION, ["a", "b"], "dev:0", None, tmp_path / "x.webp")
 
 
 def test_methods_are_compared_best_first():
@@ -122,9 +124,3 @@ def test_each_field_has_a_panel_of_its_own():
     shades = [frame[y, 360] for y in (100, 270, 445)]
     np.testing.assert_array_equal(shades[0], shades[2])
     assert np.abs(shades[0].astype(int) - shades[1]).max() > 100
-
-
-def test_policies_are_drawn_alone(tmp_path):
-    """Several policies are rejected: their measurements differ."""
-    with pytest.raises(ValueError, match="policy must be one for eitbench/Pipe2DInjection-v0, got a, b"):
-        animate("eitbench/Pipe2DInjection-v0", ["a", "b"], "dev:0", None, tmp_path / "x.webp")

@@ -4,10 +4,10 @@ import math
 
 import numpy as np
 import pytest
-from eitbench.bench.text import format_interval, format_mean, format_number, mean_and_interval
+from eitbench.bench.text import format_interval, format_mean, mean_and_interval
 from eitbench.data.seeds import seed_ranges
 from eitbench.report.boards import environment_title, run_leaderboards, world_key
-from eitbench.report.tables import run_table, terminal_tables
+from eitbench.report.tables import run_table
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
@@ -52,12 +52,6 @@ def test_interval_is_students(values):
 def test_rounded_examples(mean, half, text):
     """One digit of the interval, two after a 1 or if the mean would have only one; equal decimals."""
     assert format_mean(mean, half) == text
-
-
-@pytest.mark.parametrize(("value", "text"), [(0.01234, "0.012"), (1.234, "1.23"), (29.47, "29.5"), (999.4, "999"),
-                                           (999.6, "1000"), (3078.2, "3078"), (0.0, "0"), (-1.234, "-1.23")])
-def test_numbers_are_short_and_never_powers_of_ten(value, text):
-    assert format_number(value) == text
 
 
 @pytest.mark.parametrize("board", ["filter", "fixed-lag", "smoothing"])
@@ -151,19 +145,6 @@ def test_the_drawn_table_has_bootstrap_intervals():
     (board,) = run_leaderboards([made("mine", "filter", [0.1, 0.2, 0.15, 0.12, 0.18, 0.11])])
     (cells,) = said(run_table(board, drawn=True)).to_dict("records")
     assert cells["ẽ_c"] == format_interval(*board.rows[0].interval("error")) and "(" in cells["ẽ_c"]
-
-
-def test_terminal_tables_fit_and_name_what_is_left_out():
-    """A table has a title with common properties, aligned lines within the width, and the names of omitted columns."""
-    scores = {"contrast_error": 0.2, "nis": 1.1, "crps": 1.0, "coverage_50": 0.5, "coverage_90": 0.9}
-    found = run_leaderboards([made("mine", "filter", [0.1, 0.2], scores=scores), made("y" * 50, "filter", [0.2, 0.2])])
-    title, table, note, missing = terminal_tables(found, 70).split("\n\n")
-    assert title == "Pipe2D-v0, filter, test:0-1" and note.startswith("† ") and missing.startswith("columns omitted: ")
-    lines = table.splitlines()
-    assert len(lines) == 4 and {len(line) for line in lines} == {len(lines[0])} and len(lines[0]) <= 70
-    assert "y" * 29 + "…" in table and lines[1].split("|")[2].endswith(":")
-    uneven = terminal_tables(run_leaderboards([made("a", "filter", [0.1, 0.2]), made("b", "filter", [0.2])]), 200)
-    assert "| test:0-1" in uneven and uneven.startswith("Pipe2D-v0, filter\n")
 
 
 def test_seeds_are_named_by_their_ranges():
