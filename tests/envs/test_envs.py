@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 from eitbench.data.cache import CACHE_VARIABLE
 from eitbench.data.seeds import ReservedSeedWarning, allow_test_seeds
-from eitbench.worlds import entries
 from estimation_envs import ESTIMATION, KINDS, LAGGED, PIPE, SOLID, STIRRED, make, noise_actions
 from gymnasium.envs.registration import EnvSpec
 from gymnasium.utils.env_checker import check_env
@@ -19,19 +18,12 @@ from stable_baselines3.common.env_checker import check_env as check_env_sb3
 
 import injection_envs
 from injection_envs import BUDGET, CURRENTS, FAULTS, FLOW, INJECTION, NAME, TANK, arrays_of, play, some_actions
-from short import SHORT, short
+from short import short
 
 READINGS, WAITED = "eitbench/TankReadings-v0", "eitbench/Pipe2DInjectionInflowBudget-v0"
 POLICIES = [*((id, "reduced", "raw") for id in INJECTION), (NAME, "reduced", "scaled"), (BUDGET, "reduced", "scaled"),
             (FLOW, "reduced", "scaled"), (NAME, "none", "raw"), (CURRENTS, "none", "raw")]
 """(id, estimator, observation) of each kind of injection environment."""
-
-
-def test_every_id_has_a_short_version():
-    """Each short version has an id: all registered environments are tested here."""
-    used = [short(id)["world"] for id in entries()]
-    for changes in SHORT.values():
-        assert any(changes is each for each in used)
 
 
 def unless_slow(ids, fast):
@@ -76,29 +68,6 @@ def test_contract(id, estimator, observation):
     assert again.unwrapped.world == env.unwrapped.world and again.unwrapped.task.lag == env.unwrapped.task.lag
     for other in (pickle.loads(pickle.dumps(env)), again):
         np.testing.assert_equal(play(other, 1, actions), steps)
-
-
-def test_gymnasiums_wrapper_of_the_spec_changes_one_flag():
-    """Gymnasium's wrapper around an environment from a spec with a number of steps truncates the last step too."""
-    env = make(PIPE)
-    again = gym.make(env.spec)
-    assert [step[2:4] for step in play(again, 0, noise_actions(env))][-2:] == [(False, False), (True, True)]
-    assert gym.spec(PIPE).max_episode_steps is None
-    steps = env.spec.max_episode_steps
-    assert gym.make_vec(env.spec, num_envs=2).cores[0].length == steps
-    with pytest.raises(ValueError, match=f"must be None or the steps of an episode, {steps}, got 1"):
-        gym.make_vec(PIPE, num_envs=2, max_episode_steps=1, **short(PIPE))
-
-
-@pytest.mark.parametrize("id", ESTIMATION)
-def test_world_is_that_of_the_id_but_for_the_changes(id):
-    """The lag is set by the id or by an argument."""
-    registered = entries()[id]
-    env = make(id).unwrapped
-    assert env.world == registered.world.with_changes(short(id)["world"]) != registered.world
-    lag = registered.settings.get("lag", 0)
-    assert env.lag == env.task.lag == (env.world.n_steps - 1 if lag == "all" else lag)
-    assert make(id, lag=1).unwrapped.lag == make(id, lag=1).unwrapped.task.lag == 1
 
 
 def test_same_observation_in_another_process(tmp_path):

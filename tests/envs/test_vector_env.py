@@ -144,6 +144,8 @@ def test_observations_are_fresh_and_within_their_space(name):
             array[...] = True
         step = envs.step(action)
         assert_same_play([step], [expected])
+    with pytest.raises(ValueError, match=r"max_episode_steps must be None or the steps of an episode, .*, got 1"):
+        make(name, max_episode_steps=1)
 
 
 def test_invalid_resets_do_not_end_the_episode():
