@@ -40,7 +40,7 @@ def test_checkers_pass(id):
 
 
 @pytest.mark.parametrize("id", unless_slow(INJECTION, (NAME, CURRENTS, WAITED, FAULTS, FLOW, TANK, READINGS)))
-@pytest.mark.parametrize("kwargs", [{}, {"observation": "raw"}, {"observation": "raw", "estimator": "none"}])
+@pytest.mark.parametrize("kwargs", [{}, {"observation": "raw", "estimator": "none"}])
 @pytest.mark.filterwarnings("ignore")
 def test_checkers_pass_for_policies(id, kwargs):
     check_env(make(id, episodes=1, **kwargs).unwrapped, skip_render_check=True)
