@@ -42,7 +42,8 @@ def means_of(ax):
 
 @pytest.mark.parametrize("name", [PIPE, TANK, SOLID])
 def test_a_field_is_drawn_to_scale(name):
-    """A plot is in cm, on given axes, in the colour scale of the task; it shows the mean of an estimate."""
+    """A plot is in cm, on given axes, in the colour scale of the task; it shows the mean of an estimate. A
+    field of another mesh is rejected."""
     task = task_of(name)
     c = np.linspace(20.0, 40.0, task.mesh.n_nodes)
     ax = plt.subplots()[1]
@@ -55,14 +56,10 @@ def test_a_field_is_drawn_to_scale(name):
         assert np.ptp(ax.get_xlim()) == pytest.approx(size[0]) and ax.get_xlabel() == "x / cm"
     colours = {tuple(np.round(each.get_color()[0][:3], 2)) for each in ax.collections[1:]}
     assert len(colours) > 1 or task.mesh.dim == 3        # source, sink and the others; in 3D electrodes in the section
-
-
-def test_a_field_of_another_mesh_is_rejected():
-    task = task_of(PIPE)
     with pytest.raises(ValueError, match=rf"c must have shape \({task.mesh.n_nodes},\), got \(3,\)"):
         eitbench.plot.field(task, np.ones(3))
     with pytest.raises(ValueError, match="currents must have shape"):
-        eitbench.plot.field(task, np.ones(task.mesh.n_nodes), currents=np.ones(3))
+        eitbench.plot.field(task, c, currents=np.ones(3))
 
 
 def test_an_episode_shows_truth_and_estimate():

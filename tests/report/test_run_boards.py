@@ -43,10 +43,8 @@ def test_interval_is_students(values):
 
 
 @pytest.mark.parametrize(("mean", "half", "text"), [
-    (0.00534, 0.00041, "0.0053 ± 0.0004"), (0.00534, 0.00013, "0.00534 ± 0.00013"), (1.234, 0.5, "1.2 ± 0.5"),
-    (12.34, 3.0, "12 ± 3"), (123.4, 1.2, "123.4 ± 1.2"), (0.0096, 0.00096, "0.0096 ± 0.0010"),
-    (0.0123, math.inf, "0.0123"), (2.0, 0.0, "2"), (0.0, 0.0, "0"), (0.0129, 0.02, "0.013 ± 0.020"),
-    (0.0336, 0.2, "0.03 ± 0.20"), (0.0001, 0.2, "0.0 ± 0.2"),
+    (0.00534, 0.00041, "0.0053 ± 0.0004"), (0.00534, 0.00013, "0.00534 ± 0.00013"), (0.0123, math.inf, "0.0123"),
+    (0.0096, 0.00096, "0.0096 ± 0.0010"), (0.0, 0.0, "0"), (0.0129, 0.02, "0.013 ± 0.020"), (0.0001, 0.2, "0.0 ± 0.2"),
     (0.0012345, 1.2e-5, "0.00123 ± 0.00001"), (0.5, 4e-6, "0.5"), (1234.0, 50.0, "1234 ± 50"),
 ])
 def test_rounded_examples(mean, half, text):
@@ -54,7 +52,7 @@ def test_rounded_examples(mean, half, text):
     assert format_mean(mean, half) == text
 
 
-@pytest.mark.parametrize("board", ["filter", "fixed-lag", "smoothing"])
+@pytest.mark.parametrize("board", ["filter", "smoothing"])
 def test_skill_is_measured_on_shared_episodes(board):
     """Means are over the common episodes of all three: here only the first, (20 − 8)/(20 − 4)."""
     mine = made("mine", board, [0.008, None, None])
@@ -92,16 +90,13 @@ def test_anchors_look_back_on_the_longest_made(official):
 
 
 @pytest.mark.parametrize(("id", "kwargs", "name", "title"), [
-    ("eitbench/Pipe2DFixedLag-v0", {}, "Pipe2D", "Pipe2DFixedLag-v0"),
     ("eitbench/Pipe3DSmoothing-v0", {"lag": "all", "world": None}, "Pipe3D", "Pipe3DSmoothing-v0 (lag=all)"),
-    ("eitbench/Pipe2D-v0", {"world": {"schedule": {"scored_steps": 3}}}, "Pipe2D (schedule.scored_steps=3)",
-     "Pipe2D-v0 (schedule.scored_steps=3)"),
     ("eitbench/Pipe2DBiasedVelocity-v0", {"world": {"region": None}, "assume": {"profile": "plug"}},
      "Pipe2DBiasedVelocity (region=null)", "Pipe2DBiasedVelocity-v0 (assume.profile=plug, region=null)"),
 ])
 def test_names(id, kwargs, name, title):
     """A world's name omits lag and assumptions, which do not change the truth; a title has all arguments."""
-    given = {"environment": {"id": id, "name": "x" if kwargs else id.replace("/", "-"), "kwargs": kwargs}}
+    given = {"environment": {"id": id, "name": "x", "kwargs": kwargs}}
     assert (world_key(given), environment_title(given)) == (name, title)
 
 
