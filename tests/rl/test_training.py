@@ -48,30 +48,27 @@ def vector(episodes=3):
 
 
 def test_sb3_receives_the_observations_of_the_environments():
-    """Each step has the observations and rewards of single environments, across episodes; rewards are scaled."""
-    envs = vector()
+    """Each step has the observations and rewards of Gymnasium's vector, across episodes; rewards are scaled."""
+    envs, plain = vector(), vector()
     ours = InjectionVecEnv(envs, reward_scale=10.0)
     ours.seed(5)
     shown = ours.reset()
     started = list(envs.seeds)
     assert len(set(started)) == 3                       # else environments with equal seeds would be identical
-    single = [gym.make(NAME, episodes=3, **SHORT) for _ in range(3)]
-    expected = [env.reset(seed=k)[0] for env, k in zip(single, started, strict=True)]
-    np.testing.assert_array_equal(shown, expected)
-    assert ours.get_attr("action_space") == [env.action_space for env in single]
-    assert ours.get_attr("observation_space", [1]) == [single[1].observation_space]
+    np.testing.assert_array_equal(shown, plain.reset(seed=started)[0])
+    assert ours.get_attr("action_space") == 3 * [plain.single_action_space]
+    assert ours.get_attr("observation_space", [1]) == [plain.single_observation_space]
     rng = np.random.default_rng(0)
     for step in range(1, 8):
         actions = rng.integers(120, size=3)
         shown, rewards, ended, infos = ours.step(actions)
-        outcome = [env.step(int(action)) for env, action in zip(single, actions, strict=True)]
-        np.testing.assert_allclose(rewards, [10.0 * each[1] for each in outcome], rtol=1e-6)
-        assert ended.all() == (step == 6) == outcome[0][2]
+        expected, earned, over, *_ = plain.step(actions)
+        np.testing.assert_allclose(rewards, 10.0 * earned, rtol=1e-6)
+        assert ended.all() == (step == 6) == over.all()
         if step == 6:
-            np.testing.assert_array_equal([info["terminal_observation"] for info in infos], [e[0] for e in outcome])
-            np.testing.assert_array_equal(shown, [env.reset()[0] for env in single])
-        else:
-            np.testing.assert_array_equal(shown, [each[0] for each in outcome])
+            np.testing.assert_array_equal([info["terminal_observation"] for info in infos], expected)
+            expected = plain.step(actions)[0]                                              # begins the next episode
+        np.testing.assert_array_equal(shown, expected)
 
 
 def test_every_algorithm_finishes_a_run(run):
