@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from eitbench.data.cache import CACHE_VARIABLE
 from eitbench.data.seeds import ReservedSeedWarning, allow_test_seeds
+from eitbench.worlds import entries
 from estimation_envs import ESTIMATION, KINDS, LAGGED, PIPE, SOLID, STIRRED, make, noise_actions
 from gymnasium.envs.registration import EnvSpec
 from gymnasium.utils.env_checker import check_env
@@ -49,8 +50,8 @@ def test_checkers_pass_for_policies(id, kwargs):
 
 @pytest.mark.parametrize(("id", "estimator", "observation"), [*((id, None, None) for id in KINDS), *POLICIES])
 def test_contract(id, estimator, observation):
-    """The last step is terminated and not truncated, values have the required types, arrays are new and within their
-    spaces; pickling and the spec in JSON conserve the environment."""
+    """The world is that of the id but for the changes. The last step is terminated and not truncated, values have the
+    required types, arrays are new and within their spaces; pickling and the spec in JSON conserve the environment."""
     env = injection_envs.make(estimator, id, observation) if estimator else make(id)
     actions = some_actions(env) if estimator else noise_actions(env)
     steps = play(env, 1, actions)
@@ -64,6 +65,10 @@ def test_contract(id, estimator, observation):
         assert all(np.isscalar(value) for value in info.values())
     with pytest.raises(gym.error.ResetNeeded):
         env.unwrapped.step(actions[0])
+    world = entries()[id].world
+    assert env.unwrapped.world == world.with_changes(short(id)["world"]) != world
+    if not estimator:
+        assert make(id, lag=1).unwrapped.lag == make(id, lag=1).unwrapped.task.lag == 1
     again = gym.make(EnvSpec.from_json(env.spec.to_json()), max_episode_steps=-1)
     assert again.unwrapped.world == env.unwrapped.world and again.unwrapped.task.lag == env.unwrapped.task.lag
     for other in (pickle.loads(pickle.dumps(env)), again):
