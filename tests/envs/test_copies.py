@@ -13,7 +13,7 @@ from estimation_envs import LAGGED, PIPE, SKEWED
 from injection_envs import FAULTS, FLOW, INFLOW, NAME
 from short import DRAWN, short
 
-KINDS = [(LAGGED, {}), (SKEWED, {}), (NAME, {}), (NAME, {"estimator": "full", "observation": "raw"}), (FAULTS, {}),
+KINDS = [(LAGGED, {}), (SKEWED, {}), (NAME, {"estimator": "full", "observation": "raw"}), (FAULTS, {}),
          (FLOW, {}), (FLOW, {"estimator": "full", "world": DRAWN}), (INFLOW, {}), (INFLOW, {"estimator": "full"})]
 COPIES = {"deepcopy": copy.deepcopy, "pickle": lambda env: pickle.loads(pickle.dumps(env))}
 

@@ -23,7 +23,7 @@ from eitbench.numerics.fem import mass_matrix
 from eitbench.worlds.catalogue import PIPE_2D_DRIFTING
 from eitbench.worlds.task import make_task
 
-from injection_envs import FLOW, NAME, filter_of, make, some_pairs
+from injection_envs import FLOW, NAME, filter_of, make
 from short import WANDERING
 
 WALK = 0.1
@@ -99,15 +99,12 @@ def test_tables_hold_between_their_velocities(env):
 
 def test_observation_shows_the_velocity(env):
     """The velocity and its standard deviation are last in the scaled observation, if the flow is estimated."""
-    observation, _ = env.reset(seed=1)
-    for action in some_pairs()[:3]:
-        observation = env.step(int(action))[0]
+    env.reset(seed=1)
+    observation = env.step(7)[0]
     (velocity,), (std,) = observation["velocity"], observation["velocity_std"]
     estimated, spread = filter_of(env).velocity()
-    assert velocity == estimated[0, 0] > 0.0
-    assert 0.0 < std == spread[0, 0] < 1.0
+    assert velocity == estimated[0, 0] > 0.0 and 0.0 < std == spread[0, 0] < 1.0
     flat = flatten_scaled(env.rules, observation)
     np.testing.assert_allclose(flat[-2:], [2.0 * (velocity / 4.5 - 1.0), std], rtol=1e-6)
-    plain = make("reduced", NAME, "scaled")
-    assert flat.shape == (plain.observation_space.shape[0] + 2,)
+    assert flat.shape == (make("reduced", NAME, "scaled").observation_space.shape[0] + 2,)
     assert "velocity" not in make("reduced").observation_space.spaces

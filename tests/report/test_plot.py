@@ -42,7 +42,8 @@ def means_of(ax):
 
 @pytest.mark.parametrize("name", [PIPE, TANK, SOLID])
 def test_a_field_is_drawn_to_scale(name):
-    """A plot is in cm, on given axes, in the colour scale of the task; it shows the mean of an estimate."""
+    """A plot is in cm, on given axes, in the colour scale of the task; it shows the mean of an estimate. A
+    field of another mesh is rejected."""
     task = task_of(name)
     c = np.linspace(20.0, 40.0, task.mesh.n_nodes)
     ax = plt.subplots()[1]
@@ -55,14 +56,10 @@ def test_a_field_is_drawn_to_scale(name):
         assert np.ptp(ax.get_xlim()) == pytest.approx(size[0]) and ax.get_xlabel() == "x / cm"
     colours = {tuple(np.round(each.get_color()[0][:3], 2)) for each in ax.collections[1:]}
     assert len(colours) > 1 or task.mesh.dim == 3        # source, sink and the others; in 3D electrodes in the section
-
-
-def test_a_field_of_another_mesh_is_rejected():
-    task = task_of(PIPE)
     with pytest.raises(ValueError, match=rf"c must have shape \({task.mesh.n_nodes},\), got \(3,\)"):
         eitbench.plot.field(task, np.ones(3))
     with pytest.raises(ValueError, match="currents must have shape"):
-        eitbench.plot.field(task, np.ones(task.mesh.n_nodes), currents=np.ones(3))
+        eitbench.plot.field(task, c, currents=np.ones(3))
 
 
 def test_an_episode_shows_truth_and_estimate():
@@ -82,7 +79,7 @@ def test_an_episode_shows_truth_and_estimate():
     assert min(told) < 2 * errors and max(told) > errors / 2
 
 
-def test_an_episode_of_a_policy():
+def test_an_episode_of_a_policy(tmp_path):
     axes = eitbench.plot.episode("random_pair", INJECTION, 3, world=world(INJECTION)["world"], times=1)
     assert axes.shape == (1, 2) and "random_pair, ẽ_c =" in axes[0, 1].get_title()
     for method, seed, times, message in [
@@ -91,6 +88,8 @@ def test_an_episode_of_a_policy():
             ("homogeneous", "dev:0-1", 1, "seed must name one episode, .*, got 'dev:0-1'")]:
         with pytest.raises(ValueError, match=message):
             eitbench.plot.episode(method, PIPE, seed, world=world(PIPE)["world"], times=times)
+    with pytest.raises(ValueError, match=f"policy must be one for {INJECTION}, got a, b"):
+        animate(INJECTION, ["a", "b"], "dev:0", None, tmp_path / "x.webp")
 
 
 def test_methods_are_compared_best_first():
@@ -122,9 +121,3 @@ def test_each_field_has_a_panel_of_its_own():
     shades = [frame[y, 360] for y in (100, 270, 445)]
     np.testing.assert_array_equal(shades[0], shades[2])
     assert np.abs(shades[0].astype(int) - shades[1]).max() > 100
-
-
-def test_policies_are_drawn_alone(tmp_path):
-    """Several policies are rejected: their measurements differ."""
-    with pytest.raises(ValueError, match="policy must be one for eitbench/Pipe2DInjection-v0, got a, b"):
-        animate("eitbench/Pipe2DInjection-v0", ["a", "b"], "dev:0", None, tmp_path / "x.webp")

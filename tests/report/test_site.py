@@ -10,12 +10,10 @@ import pytest
 from eitbench._files import PACKAGE
 from eitbench.bench.table import MISSING
 from eitbench.bench.text import format_interval, format_number
-from eitbench.bench.tracks import ids
 from eitbench.report.site import (
     HEADLINE,
     LINKS,
     collect,
-    documentation,
     headline,
     render,
     render_site,
@@ -113,15 +111,6 @@ def test_numbers_are_those_of_the_boards(site):
     assert [rank for rank in ranks if rank.startswith("1")] == ["1 tied", "1 tied"]
 
 
-def test_reference_environments_have_their_tables_on_their_pages_only(rendered):
-    """The index names and links them."""
-    id = "eitbench/Pipe2DInjection-v0"
-    pages = rendered([*several_boards(), record("greedy_a", [0.1, 0.2], id=id, board="injection")])
-    page = "environments/eitbench-Pipe2DInjection-v0.html"
-    assert rows_of(pages[page], "<h2>Leaderboard</h2>") and f'href="{page}"' in pages["index.html"]
-    assert 'id="board-injection-eitbench-Pipe2DInjection-v0"' not in pages["index.html"]
-
-
 def test_a_methods_page_has_every_episode_and_its_provenance(site, rendered):
     """A method's page has recorded seeds, errors, failures, parameters, commands, and each machine once."""
     html = site["methods/failing.html"]
@@ -152,21 +141,6 @@ def test_docstrings_and_files_are_of_the_recorded_version(rendered):
         agent = record("maskable_ppo_seed0", [0.1], id=BUDGET, board="injection", method_sha256=digest,
                        checkpoint_sha256=digest)
         assert (file in rendered([agent])["methods/maskable_ppo_seed0.html"]) == (digest == ours)
-
-
-def test_agents_of_several_environments_have_no_common_title(rendered):
-    """Their page has the name as its heading; agents of one environment have a title."""
-    one, other = (record("ppo_seed0", of(0.5), id=id, board="injection", title=f"imitation in {id}",
-                         parameters={"env": id}) for id in (BUDGET, "eitbench/TankTracking-v0"))
-    for records, heading in (([one], one["title"]), ([one, other], "ppo_seed0")):
-        assert f"<h1>{heading}</h1>" in rendered(records)["methods/ppo_seed0.html"]
-
-
-def test_every_environment_is_documented():
-    """The description precedes tables; its headings are below the page's heading."""
-    for id in ids():
-        first, rest = documentation(id)
-        assert len(first) > 100 and "<table>" not in first and "<table>" in rest and "<h2>" not in first + rest, id
 
 
 LEVEL = np.array([0.20, 0.24, 0.22, 0.26, 0.18, 0.30])
@@ -267,17 +241,6 @@ def test_robustness_by_hand():
                          record("mine", [1e-9] * 4, id=NOISE, role="floor")])     # self-reported: no effect
     assert set(better[better["double noise"].str.contains("worse")].index) == {"tuned", "steady"}
     assert shift_heading("me/WeakWorn-v0", "me/Weak-v0") == "worn" and shift_heading(SHORT, HOME) == "short slugs"
-
-
-def test_robustness_is_on_the_site_and_in_the_text(site, rendered):
-    files, text = rendered(shifted()), render(collect(shifted()))["leaderboard.md"]
-    assert 'href="robustness.html"' in files["index.html"] and "robustness.html" not in site
-    for id in (SHORT, NOISE):
-        name = id.replace("/", "-")
-        assert f'href="environments/{name}.html"' in files["robustness.html"]
-        assert 'href="../robustness.html"' in files[f"environments/{name}.html"]
-    assert "Slugs pass in half the time" in files["robustness.html"]
-    assert "0.3 × 15 (worse than naive)" in text[text.index("## robustness"):]
 
 
 ERRORS = {"homogeneous": 0.02, "gauss_newton": 0.037, "extended_kalman_filter": 0.004, "automatic_filter": 0.0018}

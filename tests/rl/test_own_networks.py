@@ -1,6 +1,8 @@
 """Networks trained elsewhere, as agents and policies: from weights to a record."""
 
 import json
+import re
+from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
@@ -23,28 +25,9 @@ from tiny import git_says
 
 NAME = "eitbench/Pipe2DInjection-v0"
 SHORT = world(NAME)
-POLICY = '''"""A network in the style of CleanRL."""
-from pathlib import Path
-
-import torch
-from eitbench.rl import AgentPolicy
-
-
-class Policy(AgentPolicy):
-    files = ("agent.pt",)
-
-    def __init__(self, rules, random):
-        super().__init__(rules, random)
-        weights = torch.load(Path(__file__).with_name("agent.pt"), weights_only=True)
-        n, d = weights["weight"].shape
-        self.actor = torch.nn.Linear(d, n)
-        self.actor.load_state_dict(weights)
-
-    def choose(self, observation, mask):
-        with torch.no_grad():
-            logits = self.actor(torch.as_tensor(observation))
-        return int(logits.masked_fill(~torch.as_tensor(mask), -torch.inf).argmax())
-'''
+POLICY = re.findall(r"```python\n(.*?)```", (Path(__file__).parents[2] / "docs" / "bring-a-network.md").read_text(),
+                    re.DOTALL)[1]
+"""A policy file of the documentation, with a network in the style of CleanRL."""
 
 
 @pytest.fixture(autouse=True)
@@ -126,7 +109,6 @@ def test_what_is_no_agent_is_refused(tmp_path):
             (model, "eitbench/Pipe2D-v0", "env must be the id of an injection environment"),
             (model, gym.make("CartPole-v1"), "env must be one of eitbench/"),
             (PPO("MlpPolicy", VecNormalize(DummyVecEnv([lambda: env]))), NAME, "got normalised ones"),
-            (PPO("MlpPolicy", gym.wrappers.NormalizeObservation(env)), NAME, "got normalised ones"),
             (PPO("MlpPolicy", gym.make("CartPole-v1")), NAME, "model must have the observation_space of")]:
         with pytest.raises(ValueError, match=message):
             save_agent(each, place, tmp_path / "agent")
@@ -137,21 +119,26 @@ def test_what_is_no_agent_is_refused(tmp_path):
 
 
 @pytest.fixture
-def policy(tmp_path):
+def actor():
     env = gym.make(NAME, **SHORT)
     torch.manual_seed(0)
-    torch.save(torch.nn.Linear(env.observation_space.shape[0], env.action_space.n).state_dict(), tmp_path / "agent.pt")
+    layers = torch.nn.Linear(env.observation_space.shape[0], 64), torch.nn.Linear(64, 64)
+    return torch.nn.Sequential(layers[0], torch.nn.Tanh(), layers[1], torch.nn.Tanh(),
+                               torch.nn.Linear(64, env.action_space.n))
+
+
+@pytest.fixture
+def policy(actor, tmp_path):
+    torch.save(actor.state_dict(), tmp_path / "agent.pt")
     (tmp_path / "mine.py").write_text(POLICY)
     return tmp_path / "mine.py"
 
 
-def test_a_policy_reads_the_files_that_its_class_names(policy, tmp_path):
+def test_a_policy_reads_the_files_that_its_class_names(actor, policy, tmp_path):
     """It chooses as the network does for scaled observations, in a worker too, whose folder holds the file."""
     method = load_method(str(policy), "injection")
     actions, seen = rollout(method)
-    weights = torch.load(tmp_path / "agent.pt", weights_only=True)
-    logits = torch.as_tensor(np.array(seen)) @ weights["weight"].T + weights["bias"]
-    assert actions == logits.argmax(1).tolist()
+    assert actions == actor(torch.as_tensor(np.array(seen))).argmax(1).tolist()
     try:
         isolated = load_isolated("injection", NAME, json.dumps(SHORT), str(policy), "process")
         assert isolated.sha256 == method.sha256 and rollout(isolated)[0] == actions

@@ -103,14 +103,6 @@ def test_true_flow_past_the_obstacle_reduces_the_error():
 
 
 @pytest.mark.slow
-def test_three_dimensions():
-    """Thesis 5.2: filter < 0.6 × homogeneous and smoother < 0.8 × filter, as in 2D."""
-    filtered = error("Pipe3D", "kalman_filter")
-    assert filtered < 0.6 * error("Pipe3D", "homogeneous")
-    assert error("Pipe3DSmoothing", "fixed_interval_smoother") < 0.8 * filtered
-
-
-@pytest.mark.slow
 def test_disc_is_tracked_with_one_pair_of_electrodes():
     """Thesis 7.1: the filter's position error is less than the disc's radius, a stationary image's is far larger."""
     env = environment("RotatingTank2D")
