@@ -193,22 +193,17 @@ def with_elements(*elements: str) -> str:
 
 
 @pytest.mark.parametrize(("text", "match"), [
-    (with_elements(), "must hold only straight triangles, .* got line, vertex"),
-    (with_elements("9 2 3 1 20 30 40 10 10 10"), "got line, triangle6"),
-    (with_elements("2 2 3 1 20 30 40", "8 2 1 1 20 30 10"), "got line, line3, triangle"),
+    (with_elements("2 2 3 1 20 30 40", "8 2 1 1 20 30 10"), "only straight triangles, .* got line, line3, triangle"),
     (with_elements("2 2 3 1 20 30 40", "2 2 3 1 20 40 60"), "in a plane z = constant"),
     (SQUARE.replace("40 2 1 0", "40 2 0 0"), r"nodes must have different coordinates, got .* at \[2.0, 0.0, 0.0\]"),
     (with_elements("2 2 3 1 20 30 40"),
      "group 'electrode 1' must lie on the boundary, got 1 of 2 facets that do not"),
-    (SQUARE.replace("3 1 2 2 2 40 30", "3 1 2 2 2 40 20"),
-     "group 'walls' must lie on the boundary, got 1 of 2"),
     (SQUARE.replace('1 2 "walls"\n', "").replace("Names\n4", "Names\n3"),
      "groups of boundary facets must have a name, .* got group 2 without one"),
     (SQUARE.replace('2 3 "fluid"', '2 3 "walls"'), "must have a name, which no group of another"),
     (SQUARE.replace('0 9 "corner"', '1 9 "outlet"'), "group 'outlet' must hold facets, got none"),
     (SQUARE[:-80], "must be a complete mesh file in a format that meshio reads"),
-    ("", "must be a complete mesh file"), (SQUARE.replace("2.2 0 8", "1.0 0 8"), "cannot be read .*Need mesh format"),
-])
+    (SQUARE.replace("2.2 0 8", "1.0 0 8"), "cannot be read .*Need mesh format")])
 def test_files_that_are_refused(text, match, tmp_path, capsys):
     """Messages contain the file, the problem and the expectation; nothing is printed."""
     file = written(tmp_path, text)
@@ -218,20 +213,15 @@ def test_files_that_are_refused(text, match, tmp_path, capsys):
 
 
 def test_files_that_are_not_there(tmp_path):
-    """A folder, an unknown suffix and a wrong scale are rejected."""
+    """A folder and a wrong scale are rejected."""
     with pytest.raises(ValueError, match="file not found"):
         read_mesh(tmp_path)
-    (tmp_path / "pipe.xyzzy").write_text("nonsense")
-    with pytest.raises(ValueError, match=r"pipe\.xyzzy: must be a complete mesh file in a format"):
-        read_mesh(tmp_path / "pipe.xyzzy")
     with pytest.raises(ValueError, match="scale must be a"):
         read_mesh(written(tmp_path, SQUARE), scale=-1.0)
 
 
 def test_without_meshio_the_extra_is_named(tmp_path, monkeypatch):
     """Built-in worlds do not need meshio."""
-    path = tmp_path / "it.msh"
-    path.write_text(SQUARE)
     monkeypatch.setitem(sys.modules, "meshio", None)
     with pytest.raises(ValueError, match=r"reading mesh files needs the extra mesh, pip install 'eitbench\[mesh\]'"):
-        read_mesh(path)
+        read_mesh(written(tmp_path, SQUARE))

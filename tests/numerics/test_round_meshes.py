@@ -159,28 +159,18 @@ SQUARE = np.pi / 2 * np.arange(4)
 
 
 @pytest.mark.parametrize(("call", "match"), [
-    (lambda: disc_mesh([], []), "radii must hold at least one radius"),
     (lambda: disc_mesh([1.0, 1.0], [SQUARE, SQUARE]), "radii must .* strictly increasing"),
-    (lambda: disc_mesh([0.0, 1.0], [SQUARE, SQUARE]), "radii must be positive"),
     (lambda: disc_mesh([1.0, 2.0], [SQUARE]), "angles must hold one sequence for each of the 2 radii, got 1"),
-    (lambda: disc_mesh([1.0], [SQUARE[:2]]), r"angles\[0\] must hold at least three"),
     (lambda: disc_mesh([1.0, 2.0], [SQUARE, SQUARE[::-1]]), r"angles\[1\] must .* strictly increasing"),
     (lambda: disc_mesh([1.0], [4 / 3 * SQUARE]), r"angles\[0\] must .* within one turn"),
-    (lambda: disc_mesh([1.0], [SQUARE * np.nan]), r"angles\[0\] must be finite"),
     (lambda: disc_mesh([1.0, 1.1], [2 * np.pi * np.arange(12) / 12, SQUARE]), "angles must be dense"),
-    (lambda: uniform_disc(0.0, 3), "radius must be a finite number"),
     (lambda: uniform_disc(1.0, 0), "rings must be an integer"),
     (lambda: electrode_disc(-1.0, SPANS, 3, 3), "radius must be a finite number"),
-    (lambda: electrode_disc(R, SPANS, 0, 3), "cells_at_electrodes must be an integer"),
-    (lambda: electrode_disc(R, SPANS, 3, 0), "rings must be an integer"),
     (lambda: electrode_disc(R, SPANS[::-1], 3, 3), "spans must .* increase"),
-    (lambda: electrode_disc(R, SPANS[:0], 3, 3), "spans must hold at least one electrode"),
     (lambda: electrode_disc(R, np.array([[0.0, 1.0], [1.0, 2.0]]), 3, 3), "spans must .* keep a gap"),
     (lambda: electrode_disc(R, np.array([[0.0, 1.0], [5.0, 6.5]]), 3, 3), "spans must .* within one turn"),
-    (lambda: electrode_disc(R, SPANS, 3, 3, (0.5, 1.0)), "grading must be a finite number"),
     (lambda: extrude(extrude(SECTIONS["uniform"], Z), Z), "section must be a mesh of triangles, got one in 3D"),
     (lambda: extrude(SECTIONS["uniform"], [0.0, 1.0, 1.0]), "z must hold at least two strictly increasing"),
-    (lambda: round_pipe_mesh(np.nan, R, SPANS, np.array([[0.03, 0.07]]), (2, 2), 3), "length must be a finite number"),
     (lambda: round_pipe_mesh(0.05, R, SPANS, np.array([[0.03, 0.07]]), (2, 2), 3), "spans_along must .* inside the"),
     (lambda: round_pipe_mesh(0.4, R, SPANS, np.array([[0.03, 0.07]]), (2, 0), 3), "cells_at_electrodes.*an integer")])
 def test_wrong_arguments_are_refused(call, match):

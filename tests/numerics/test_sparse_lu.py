@@ -42,9 +42,8 @@ def test_dense_solution(n, k):
 
 
 @pytest.mark.parametrize("layout", [
-    np.asfortranarray, lambda right: np.repeat(right, 2, axis=1)[:, ::2],
-    lambda right: np.ascontiguousarray(right.T).T, lambda right: np.rint(9 * right).astype(int),
-], ids=["Fortran", "slice", "transposed", "integers"])
+    np.asfortranarray, lambda right: np.repeat(right, 2, axis=1)[:, ::2], lambda right: np.rint(9 * right).astype(int),
+], ids=["Fortran", "slice", "integers"])
 def test_any_memory_layout(layout):
     """Right-hand sides may have any memory layout."""
     solver = SparseLU(sp.csr_array(random_matrix(60, seed=2)))
