@@ -135,7 +135,7 @@ def test_skill_runs_from_the_homogeneous_estimate_to_the_reference():
     assert values == pytest.approx([0.0, 0.5, 1.0, -1.0])
 
 
-@pytest.mark.parametrize(("left", "right"), [((3, 4), (3, 5)), ((3, 4), (1, 4)), ((4,), (4,)), ((2, 3, 4), (2, 3, 4))])
+@pytest.mark.parametrize(("left", "right"), [((3, 4), (1, 4)), ((4,), (4,))])
 @pytest.mark.parametrize("score", [
     lambda a, b: relative_error(a, b, np.eye(4)), voltage_discrepancy,
     lambda a, b: crps(a, np.ones_like(a), b, np.ones(4)), lambda a, b: coverage(a, np.ones_like(a), b, np.ones(4), 0.5),

@@ -104,12 +104,6 @@ def test_a_rejected_registration_has_no_effect(id, settings, message):
     assert id not in entries() and id not in gym.registry and not hands()
 
 
-def test_an_id_that_nobody_registered_is_named():
-    """The message lists the most similar ids."""
-    with pytest.raises(ValueError, match=r"env must be one of eitbench/.*, … \([0-9]+ in all\); got 'mine/"):
-        entry(ID)
-
-
 def test_the_last_registration_is_used():
     """A process that works for several scripts uses the registration of the current one."""
     register(QUIET, ID)

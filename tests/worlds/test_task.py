@@ -1,6 +1,7 @@
 """`Task`: information for an estimator, without the ground truth."""
 
 import functools
+import gc
 import types
 from dataclasses import replace
 
@@ -58,30 +59,18 @@ def test_assumed_velocity_changes_the_model_not_the_world(cache):
 
 
 def reachable(start):
-    """Return all objects that can be reached from ``start`` by attributes, items and closures."""
+    """Return all objects that can be reached from ``start`` by attributes, items, closures and caches."""
     found, waiting = {}, [start]
     while waiting:
         thing = waiting.pop()
-        if id(thing) in found or isinstance(thing, (type, types.ModuleType)):
+        if id(thing) in found or isinstance(thing, (type, types.ModuleType, types.CodeType)):
             continue
         found[id(thing)] = thing
         if isinstance(thing, np.ndarray):
             waiting += [] if thing.base is None else [thing.base]
             waiting += list(thing.ravel()) if thing.dtype == object else []
-        elif isinstance(thing, dict):
-            waiting += [*thing.keys(), *thing.values()]
-        elif isinstance(thing, (list, tuple, set, frozenset)):
-            waiting += list(thing)
-        elif isinstance(thing, types.MethodType):
-            waiting += [thing.__self__, thing.__func__]
-        elif isinstance(thing, functools.partial):
-            waiting += [thing.func, thing.args, thing.keywords]
-        elif isinstance(thing, types.FunctionType):  # its globals reach everything, so they are skipped
-            waiting += [cell.cell_contents for cell in thing.__closure__ or ()]
-            waiting.append(thing.__defaults__)
-        waiting += [vars(thing)] if hasattr(thing, "__dict__") else []
-        slots = [name for kind in type(thing).__mro__ for name in getattr(kind, "__slots__", ())]
-        waiting += [getattr(thing, name) for name in slots if isinstance(name, str) and hasattr(thing, name)]
+        own = getattr(thing, "__globals__", None)    # a function's globals reach everything, so they are skipped
+        waiting += [each for each in gc.get_referents(thing) if each is not own]
     return list(found.values())
 
 
