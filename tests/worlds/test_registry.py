@@ -140,16 +140,6 @@ def test_modules_of_entry_points_are_imported(monkeypatch, tmp_path):
     assert not hands()
 
 
-def test_groups():
-    """Each built-in id is in a group; variants and injection have their own."""
-    own = [each for id, each in entries().items() if id.startswith("eitbench/")]
-    assert {each.group for each in own} == set(registry.GROUPS) - {"user-defined"}
-    assert all((each.group == "robustness variants") == bool(each.nominal) for each in own)
-    assert all((each.group == "injection") == (each.track == "injection") for each in own)
-    register(QUIET, ID)
-    assert entry(ID).group == "user-defined"
-
-
 @pytest.mark.parametrize("id", [id for id, each in entries().items() if each.nominal])
 def test_a_variant_is_the_environment_of_its_id(id):
     """The world is the same object; the nominal id alone gives the nominal world."""
