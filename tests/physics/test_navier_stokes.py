@@ -12,7 +12,7 @@ from eitbench.physics.flow import PlaneChannelFlow
 from eitbench.physics.navier_stokes import SteadyFlow, steady_flow
 from numpy.testing import assert_allclose, assert_array_equal
 
-from shapes import orders, polar_mesh, shaken_rectangle, uniform
+from shapes import box_mesh, orders, polar_mesh, shaken_rectangle, uniform
 
 AT_REST = uniform(0.0, 0.0)
 
@@ -205,9 +205,12 @@ ALL = SQUARE.boundary_facets
     (0.1, [(ALL, lambda points: points)], None, "walls must let as much fluid in as out, .* net outflow of 2 m²/s"),
 ])
 def test_errors_name_the_argument(viscosity, walls, force, match):
-    """Numbers out of range, inner facets, non-finite fields and walls with a net outflow are rejected by name."""
+    """Numbers out of range, inner facets, non-finite fields and walls with a net outflow are rejected by name, and
+    meshes in 3D."""
     with pytest.raises(ValueError, match=match):
         steady_flow(SQUARE, viscosity, walls, force=force)
+    with pytest.raises(ValueError, match="mesh must be 2D, got 3D"):
+        steady_flow(box_mesh(np.ones(3), (1, 1, 1)), viscosity, walls)
 
 
 def test_flow_that_is_not_found_is_an_error():

@@ -21,7 +21,7 @@ from eitbench.worlds.flows import NoFlow
 from eitbench.worlds.random_streams import episode_streams, generator_from_state
 from eitbench.worlds.vessels import Bulge, PlanePipe
 
-SMALL_3D = dataclasses.replace(PIPE_3D.vessel, electrode_rings=2, electrodes_per_ring=4)
+SMALL_3D = dataclasses.replace(PIPE_3D.vessel, electrode_rings=1, electrodes_per_ring=6)
 
 
 def test_only_what_is_named_changes():
