@@ -7,17 +7,11 @@ from eitbench import _notice
 from eitbench._notice import SlowTaskNotice
 
 
-@pytest.fixture
-def clock(monkeypatch):
-    """A clock with a settable time."""
-    now = [0.0]
-    monkeypatch.setattr(_notice.time, "monotonic", lambda: now[0])
-    return now
-
-
 @pytest.mark.parametrize(("seconds_a_step", "said"), [(0.1, 1), (0.01, 0)])
-def test_long_tasks_are_reported_once(seconds_a_step, said, clock, caplog):
+def test_long_tasks_are_reported_once(seconds_a_step, said, monkeypatch, caplog):
     caplog.set_level(logging.INFO, "eitbench")
+    clock = [0.0]
+    monkeypatch.setattr(_notice.time, "monotonic", lambda: clock[0])
     wait = SlowTaskNotice("making it", 100, "a command does so beforehand")
     for _ in range(100):
         clock[0] += seconds_a_step

@@ -105,14 +105,11 @@ def test_calibrated_gaussians_have_the_nominal_coverage(level):
                                                                            - 1, abs=5 * deviation)
 
 
-def test_an_exact_estimate_without_uncertainty_is_covered():
-    """Rounding does not decide: 0.1 + 0.2 and 0.3 agree, 0.3001 does not."""
+def test_coverage_at_single_nodes():
+    """Rounding does not decide without uncertainty: 0.1 + 0.2 and 0.3 agree, 0.3001 does not. With weights, the truth
+    lies inside 90 % of a unit Gaussian (±1.645) at one node, at the other outside."""
     mean, truth = np.array([[0.1 + 0.2, 0.3001]]), np.full((1, 2), 0.3)
     assert coverage(mean, np.zeros((1, 2)), truth, np.ones(2), 0.9) == pytest.approx(0.5, rel=1e-14)
-
-
-def test_coverage_is_weighted_over_space():
-    """At one node the truth lies inside 90 % of a unit Gaussian (±1.645), at the other outside."""
     mean, std, truth = np.zeros((1, 2)), np.ones((1, 2)), np.array([[1.64, -1.65]])
     assert coverage(mean, std, truth, np.array([3.0, 1.0]), 0.9) == pytest.approx(0.75, rel=1e-14)
 
@@ -135,7 +132,7 @@ def test_skill_runs_from_the_homogeneous_estimate_to_the_reference():
     assert values == pytest.approx([0.0, 0.5, 1.0, -1.0])
 
 
-@pytest.mark.parametrize(("left", "right"), [((3, 4), (3, 5)), ((3, 4), (1, 4)), ((4,), (4,)), ((2, 3, 4), (2, 3, 4))])
+@pytest.mark.parametrize(("left", "right"), [((3, 4), (1, 4)), ((4,), (4,))])
 @pytest.mark.parametrize("score", [
     lambda a, b: relative_error(a, b, np.eye(4)), voltage_discrepancy,
     lambda a, b: crps(a, np.ones_like(a), b, np.ones(4)), lambda a, b: coverage(a, np.ones_like(a), b, np.ones(4), 0.5),

@@ -109,13 +109,9 @@ ONES = np.ones((1701, 1))
     (lambda tiny: eitbench.dataset("eitbench/Nowhere-v0", "train:0"), "env must be one of"),
     (lambda tiny: eitbench.dataset(PIPE, []), r"at least one episode, got \[\]"),
     (lambda tiny: eitbench.dataset(PIPE, [1.5]), "seeds must be an integer"),
-    (lambda tiny: eitbench.dataset(PIPE, [3, 200_003]),
-     "must name the split .* 'test:3', got 200003"),
-    (lambda tiny: eitbench.dataset(PIPE, "200003"), "must name the split of test episodes"),
+    (lambda tiny: eitbench.dataset(PIPE, [3, 200_003]), "must name the split .* 'test:3', got 200003"),
     (lambda tiny: tiny.errors(tiny[0], tiny[0].truth[:-1]), "estimate must have shape"),
-    (lambda tiny: tiny.project(np.ones((3, 2))), "basis"),
     (lambda tiny: tiny.project(np.repeat(ONES, 2, axis=1)), "some of these 2 depend"),
-    (lambda tiny: tiny.project(ONES, np.zeros(3)), "mean"),
     (lambda tiny: tiny.project(ONES, "much"), "mean must be an array")])
 def test_mistakes_are_explained(tiny, call, message):
     with pytest.raises(ValueError, match=message):

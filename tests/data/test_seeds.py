@@ -11,7 +11,6 @@ numbers = st.integers(0, 99_999)
 
 
 def test_splits_are_disjoint():
-    assert list(SPLITS) == ["train", "dev", "test"]
     assert len(set().union(*SPLITS.values())) == sum(map(len, SPLITS.values()))
 
 
@@ -33,7 +32,7 @@ def test_parts_add_up_without_repeats(split, parts):
 
 
 @pytest.mark.parametrize(("text", "message"), [
-    ("", "look like"), ("test:1,,2", "look like"), ("test:1.5", "look like"), ("exam:3", "one of the splits"),
+    ("test:1,,2", "look like"), ("exam:3", "one of the splits"),
     ("test:4-1", "must increase"), ("dev:99999-100000", "stay below 100000"), (str(2**31), "stay below 2147483648"),
 ])
 def test_errors_say_what_was_expected(text, message):

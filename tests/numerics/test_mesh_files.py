@@ -1,6 +1,5 @@
 """Meshes and groups of facets from files: round trips, files written by gmsh, and errors."""
 
-import hashlib
 import re
 import sys
 from pathlib import Path
@@ -50,29 +49,14 @@ def test_round_trip(dim, tmp_path):
     assert_array_equal(small.groups["inlet"], groups["inlet"])
 
 
-@pytest.mark.parametrize(("dim", "format", "ending"), [(2, "gmsh22", "msh"), (3, "vtk", "vtk"), (3, "vtu", "vtu")])
-def test_other_formats(dim, format, ending, tmp_path):
+def test_another_format(tmp_path):
     """Formats of meshio are read; a file without groups has an empty dictionary."""
-    mesh = MESHES[dim]
-    file = tmp_path / f"box.{ending}"
-    points = np.pad(mesh.points, ((0, 0), (0, 3 - dim)))
-    meshio.Mesh(points, [("triangle" if dim == 2 else "tetra", mesh.cells)]).write(
-        file, file_format=format, binary=True)
+    mesh, file = MESHES[3], tmp_path / "box.vtu"
+    meshio.Mesh(mesh.points, [("tetra", mesh.cells)]).write(file)
     read = read_mesh(file)
     assert_array_equal(read.mesh.points, mesh.points)
     assert_array_equal(read.mesh.cells, mesh.cells)
     assert read.groups == {}
-
-
-def test_the_right_file_is_read(tmp_path):
-    """A SHA-256 is accepted in upper and lower case; an error for another file contains both."""
-    write_mesh(tmp_path / "box.msh", MESHES[2])
-    sha256 = hashlib.sha256((tmp_path / "box.msh").read_bytes()).hexdigest()
-    for digits in (sha256, sha256.upper()):
-        assert read_mesh(tmp_path / "box.msh", digits).mesh.n_nodes == MESHES[2].n_nodes
-    other = "0" * 64
-    with pytest.raises(ValueError, match=f"box.msh: must be .* SHA-256 {other}, got .* {sha256}"):
-        read_mesh(tmp_path / "box.msh", other)
 
 
 SQUARE = """$MeshFormat
@@ -193,22 +177,17 @@ def with_elements(*elements: str) -> str:
 
 
 @pytest.mark.parametrize(("text", "match"), [
-    (with_elements(), "must hold only straight triangles, .* got line, vertex"),
-    (with_elements("9 2 3 1 20 30 40 10 10 10"), "got line, triangle6"),
-    (with_elements("2 2 3 1 20 30 40", "8 2 1 1 20 30 10"), "got line, line3, triangle"),
+    (with_elements("2 2 3 1 20 30 40", "8 2 1 1 20 30 10"), "only straight triangles, .* got line, line3, triangle"),
     (with_elements("2 2 3 1 20 30 40", "2 2 3 1 20 40 60"), "in a plane z = constant"),
     (SQUARE.replace("40 2 1 0", "40 2 0 0"), r"nodes must have different coordinates, got .* at \[2.0, 0.0, 0.0\]"),
     (with_elements("2 2 3 1 20 30 40"),
      "group 'electrode 1' must lie on the boundary, got 1 of 2 facets that do not"),
-    (SQUARE.replace("3 1 2 2 2 40 30", "3 1 2 2 2 40 20"),
-     "group 'walls' must lie on the boundary, got 1 of 2"),
     (SQUARE.replace('1 2 "walls"\n', "").replace("Names\n4", "Names\n3"),
      "groups of boundary facets must have a name, .* got group 2 without one"),
     (SQUARE.replace('2 3 "fluid"', '2 3 "walls"'), "must have a name, which no group of another"),
     (SQUARE.replace('0 9 "corner"', '1 9 "outlet"'), "group 'outlet' must hold facets, got none"),
     (SQUARE[:-80], "must be a complete mesh file in a format that meshio reads"),
-    ("", "must be a complete mesh file"), (SQUARE.replace("2.2 0 8", "1.0 0 8"), "cannot be read .*Need mesh format"),
-])
+    (SQUARE.replace("2.2 0 8", "1.0 0 8"), "cannot be read .*Need mesh format")])
 def test_files_that_are_refused(text, match, tmp_path, capsys):
     """Messages contain the file, the problem and the expectation; nothing is printed."""
     file = written(tmp_path, text)
@@ -218,20 +197,15 @@ def test_files_that_are_refused(text, match, tmp_path, capsys):
 
 
 def test_files_that_are_not_there(tmp_path):
-    """A folder, an unknown suffix and a wrong scale are rejected."""
+    """A folder and a wrong scale are rejected."""
     with pytest.raises(ValueError, match="file not found"):
         read_mesh(tmp_path)
-    (tmp_path / "pipe.xyzzy").write_text("nonsense")
-    with pytest.raises(ValueError, match=r"pipe\.xyzzy: must be a complete mesh file in a format"):
-        read_mesh(tmp_path / "pipe.xyzzy")
     with pytest.raises(ValueError, match="scale must be a"):
         read_mesh(written(tmp_path, SQUARE), scale=-1.0)
 
 
 def test_without_meshio_the_extra_is_named(tmp_path, monkeypatch):
     """Built-in worlds do not need meshio."""
-    path = tmp_path / "it.msh"
-    path.write_text(SQUARE)
     monkeypatch.setitem(sys.modules, "meshio", None)
     with pytest.raises(ValueError, match=r"reading mesh files needs the extra mesh, pip install 'eitbench\[mesh\]'"):
-        read_mesh(path)
+        read_mesh(written(tmp_path, SQUARE))

@@ -6,7 +6,6 @@ import re
 
 import numpy as np
 import pytest
-from eitbench.numerics.fem import mass_matrix
 from eitbench.numerics.mesh import Mesh, graded_interval, rectangle_mesh
 from eitbench.numerics.round_meshes import disc_mesh, electrode_disc, extrude, round_pipe_mesh, uniform_disc
 from numpy.testing import assert_allclose, assert_array_equal
@@ -125,18 +124,6 @@ def test_prisms_are_filled_and_neighbours_agree(section):
     assert_allclose(area.sum(), 2 * section.volumes.sum() + around * np.ptp(Z), rtol=1e-12)
 
 
-def test_extruded_mesh_is_its_own_mirror_image():
-    """Diagonals alternate: with an even number of equal layers z → −z maps cells on cells, and so the mass matrix."""
-    section = uniform_disc(R, 2)
-    body = extrude(section, np.linspace(-0.1, 0.1, 5))
-    turned = np.arange(body.n_nodes).reshape(5, -1)[::-1].ravel()
-    mass = mass_matrix(body).toarray()
-    assert_allclose(mass[np.ix_(turned, turned)], mass, rtol=1e-12, atol=1e-20)
-    one_way = mass_matrix(extrude(section, np.linspace(-0.1, 0.0, 2))).toarray()
-    swapped = np.arange(2 * section.n_nodes).reshape(2, -1)[::-1].ravel()
-    assert not np.allclose(one_way[np.ix_(swapped, swapped)], one_way, rtol=1e-3)      # a single layer is not
-
-
 def test_round_pipe_mesh():
     """All edges of the electrodes are mesh lines on the wall; they have the area of their chords times their length."""
     along = np.array([[0.03, 0.07], [0.13, 0.17]])
@@ -159,28 +146,18 @@ SQUARE = np.pi / 2 * np.arange(4)
 
 
 @pytest.mark.parametrize(("call", "match"), [
-    (lambda: disc_mesh([], []), "radii must hold at least one radius"),
     (lambda: disc_mesh([1.0, 1.0], [SQUARE, SQUARE]), "radii must .* strictly increasing"),
-    (lambda: disc_mesh([0.0, 1.0], [SQUARE, SQUARE]), "radii must be positive"),
     (lambda: disc_mesh([1.0, 2.0], [SQUARE]), "angles must hold one sequence for each of the 2 radii, got 1"),
-    (lambda: disc_mesh([1.0], [SQUARE[:2]]), r"angles\[0\] must hold at least three"),
     (lambda: disc_mesh([1.0, 2.0], [SQUARE, SQUARE[::-1]]), r"angles\[1\] must .* strictly increasing"),
     (lambda: disc_mesh([1.0], [4 / 3 * SQUARE]), r"angles\[0\] must .* within one turn"),
-    (lambda: disc_mesh([1.0], [SQUARE * np.nan]), r"angles\[0\] must be finite"),
     (lambda: disc_mesh([1.0, 1.1], [2 * np.pi * np.arange(12) / 12, SQUARE]), "angles must be dense"),
-    (lambda: uniform_disc(0.0, 3), "radius must be a finite number"),
     (lambda: uniform_disc(1.0, 0), "rings must be an integer"),
     (lambda: electrode_disc(-1.0, SPANS, 3, 3), "radius must be a finite number"),
-    (lambda: electrode_disc(R, SPANS, 0, 3), "cells_at_electrodes must be an integer"),
-    (lambda: electrode_disc(R, SPANS, 3, 0), "rings must be an integer"),
     (lambda: electrode_disc(R, SPANS[::-1], 3, 3), "spans must .* increase"),
-    (lambda: electrode_disc(R, SPANS[:0], 3, 3), "spans must hold at least one electrode"),
     (lambda: electrode_disc(R, np.array([[0.0, 1.0], [1.0, 2.0]]), 3, 3), "spans must .* keep a gap"),
     (lambda: electrode_disc(R, np.array([[0.0, 1.0], [5.0, 6.5]]), 3, 3), "spans must .* within one turn"),
-    (lambda: electrode_disc(R, SPANS, 3, 3, (0.5, 1.0)), "grading must be a finite number"),
     (lambda: extrude(extrude(SECTIONS["uniform"], Z), Z), "section must be a mesh of triangles, got one in 3D"),
     (lambda: extrude(SECTIONS["uniform"], [0.0, 1.0, 1.0]), "z must hold at least two strictly increasing"),
-    (lambda: round_pipe_mesh(np.nan, R, SPANS, np.array([[0.03, 0.07]]), (2, 2), 3), "length must be a finite number"),
     (lambda: round_pipe_mesh(0.05, R, SPANS, np.array([[0.03, 0.07]]), (2, 2), 3), "spans_along must .* inside the"),
     (lambda: round_pipe_mesh(0.4, R, SPANS, np.array([[0.03, 0.07]]), (2, 0), 3), "cells_at_electrodes.*an integer")])
 def test_wrong_arguments_are_refused(call, match):

@@ -4,8 +4,6 @@ import math
 
 import numpy as np
 import pytest
-from eitbench.numerics.fem import mass_matrix
-from eitbench.numerics.round_meshes import uniform_disc
 from eitbench.physics.flow import PlaneChannelFlow, PowerLawFlow, RoundPipeFlow
 from eitbench.physics.profiles import SkewedChannelFlow, VelocityModel, parabolic_model
 from eitbench.worlds import entry
@@ -20,30 +18,6 @@ ROUND = entry("eitbench/Pipe3DUnknownVelocity-v0").world.velocity_model
 ROUND_POINTS = np.random.default_rng(1).uniform(-0.7 * R, 0.7 * R, (100, 3))
 
 
-def skewed_mean(k):
-    """Return ½ ∫ (1 − η²)·exp(kη) dη over [−1, 1], by parts."""
-    return 2.0 * (k * math.cosh(k) - math.sinh(k)) / k**3
-
-
-@pytest.mark.parametrize("flow", [PlaneChannelFlow(4.5, R), *(SkewedChannelFlow(4.5, R, k) for k in (
-    -5.0, -0.6, 0.0, 0.3, 2.5, 5.0))], ids=str)
-def test_mean_over_a_section_is_the_mean_velocity(flow):
-    """(1/2R) ∫ v dy = v̄ to rounding, by a quadrature of more points than in the flow."""
-    eta, weights = np.polynomial.legendre.leggauss(60)
-    velocity = flow(np.column_stack([np.full(60, 0.13), R * eta]))
-    assert 0.5 * weights @ velocity[:, 0] == pytest.approx(4.5, rel=1e-13)
-
-
-@pytest.mark.parametrize("flow", [PlaneChannelFlow(4.5, R), PowerLawFlow(4.5, R), SkewedChannelFlow(4.5, R, 0.8),
-                                  MODEL.field((4.0, -1.0, 2.0))], ids=lambda flow: type(flow).__name__)
-def test_flow_has_no_divergence(flow):
-    """The flow is axial and equal in every section: ∂v₁/∂x = 0 and v₂ = 0, bit-identical."""
-    velocity = flow(POINTS)
-    np.testing.assert_array_equal(velocity[:, 1], 0.0)
-    np.testing.assert_array_equal(flow(POINTS + np.array([0.1, 0.0])), velocity)
-    assert np.ptp(velocity[:, 0]) > 1.0
-
-
 @pytest.mark.parametrize("exponent", [1 / 7, 1 / 3, 1.0, 2.0])
 def test_power_law_has_the_requested_mean(exponent):
     """(1/R) ∫₀ᴿ v dy = v̄ on both sides, with the variable t = (1 − y/R)^(1/7), in which v is smooth."""
@@ -54,32 +28,14 @@ def test_power_law_has_the_requested_mean(exponent):
         assert weights @ (velocity[:, 0] * 7 * t**6) == pytest.approx(4.5, rel=1e-9)
 
 
-def test_round_pipe_carries_its_mean_velocity():
-    """(1/πR²) ∫ v dA = v̄: Gauss–Legendre in r² is exact for the paraboloid; finite elements converge like h².
-
-    The nodal values on a polygon give 1 − O(h²): the difference falls by four when the rings are doubled.
-    """
-    flow = RoundPipeFlow(4.5, R)
-    s, weights = np.polynomial.legendre.leggauss(2)
-    r = R * np.sqrt(0.5 * (s + 1.0))
-    points = np.column_stack([r * np.cos(2.0), r * np.sin(2.0), [0.1, 0.3]])
-    assert 0.5 * weights @ flow(points)[:, 2] == pytest.approx(4.5, rel=1e-14)
-    lost = []
-    for rings in (5, 10):
-        mesh = uniform_disc(R, rings)
-        speed = flow(np.column_stack([mesh.points, np.zeros(mesh.n_nodes)]))[:, 2]
-        lost.append(1.0 - (mass_matrix(mesh) @ speed).sum() / (4.5 * np.pi * R**2))
-    assert 0 < lost[1] < 0.02
-    assert lost[0] / lost[1] == pytest.approx(4.0, rel=0.1)
-
-
-@pytest.mark.parametrize("k", [-1.0, 0.8, 5.0])
+@pytest.mark.parametrize("k", [-5.0, -1.0, 0.3, 0.8, 5.0])
 def test_skewed_profile_is_the_formula(k):
     """v = v̄ (1 − η²)·exp(kη) over its mean in closed form: at rest on the walls, fastest at η = (√(1 + k²) − 1)/k;
     turned over it is the flow of opposite skewness."""
     eta = np.linspace(-1.0, 1.0, 2001)
+    mean = 2.0 * (k * math.cosh(k) - math.sinh(k)) / k**3                      # ½ ∫(1 − η²)·exp(kη) dη, by parts
     profile = SkewedChannelFlow(2.0, R, k).profile(R * eta)
-    np.testing.assert_allclose(profile, 2.0 * (1.0 - eta**2) * np.exp(k * eta) / skewed_mean(k), rtol=1e-12)
+    np.testing.assert_allclose(profile, 2.0 * (1.0 - eta**2) * np.exp(k * eta) / mean, rtol=1e-12)
     np.testing.assert_array_equal(profile[[0, -1]], 0.0)
     assert eta[profile.argmax()] == pytest.approx((math.sqrt(1.0 + k**2) - 1.0) / k, abs=1e-3)
     np.testing.assert_allclose(SkewedChannelFlow(2.0, R, -k).profile(-R * eta), profile, rtol=1e-13)
@@ -94,19 +50,18 @@ def test_skewed_profile_is_the_formula(k):
     (RoundPipeFlow(2.0, 0.3), [[0.0, 0.0, -1.0], [0.0, 0.0, 5.0]], [4.0, 4.0]),
     (RoundPipeFlow(2.0, 1.0), [[0.6, -0.8, 2.0], [0.66, 0.88, 0.0]], [0.0, 0.0]),
     # points of an integer type: 1.5·(1 − ¼) is not rounded to 1
-    (PlaneChannelFlow(1.0, 2.0), [[0, 1]], [1.125]),
-    (SkewedChannelFlow(1.0, 2.0), [[0, 1]], [1.125]),
+    (PlaneChannelFlow(1.0, 2.0), [[0, 1]], [1.125]), (SkewedChannelFlow(1.0, 2.0), [[0, 1]], [1.125]),
     (parabolic_model(2.0, 1.0, 1.0, 0.0).field([1.0]), [[0, 1]], [1.125]),
-    (PowerLawFlow(1.0, 2.0, 0.5), [[0, 1]], [1.5 * np.sqrt(0.5)]),
-    (PowerLawFlow(0.5, 2.0, 0.0), [[0, 1]], [0.5]), (RoundPipeFlow(1.0, 2.0), [[0, 1, 0]], [1.5]),
+    (PowerLawFlow(1.0, 2.0, 0.5), [[0, 1]], [1.5 * np.sqrt(0.5)]), (RoundPipeFlow(1.0, 2.0), [[0, 1, 0]], [1.5]),
 ], ids=lambda value: type(value).__name__)
 def test_velocity_at_points(flow, points, expected):
     """No slip at the walls and nothing upstream beyond them; on the axis 1.5·v̄ in a channel, 2·v̄
     in a round pipe, (8/7)·v̄ for the exponent 1/7, and half of it at 1/128 of R from the wall; v̄
-    at any point for plug flow; nothing across."""
+    at any point for plug flow; nothing across. No divergence: it is the same in every section."""
     velocity = flow(np.array(points))
     axis = 2 if isinstance(flow, RoundPipeFlow) else 0
     np.testing.assert_allclose(velocity[:, axis], expected, rtol=1e-14, atol=1e-14)
+    np.testing.assert_array_equal(flow(np.array(points) + np.eye(len(points[0]), dtype=int)[axis]), velocity)
     np.testing.assert_array_equal(np.delete(velocity, axis, axis=1), 0.0)
 
 
@@ -135,7 +90,6 @@ def test_quadrature_and_profiles():
     for degree in range(48):
         exact = 2.0 * R**(degree + 1) / (degree + 1) if degree % 2 == 0 else 0.0
         assert MODEL.weights @ MODEL.points**degree == pytest.approx(exact, rel=1e-13, abs=1e-13 * R**(degree + 1))
-    assert len(MODEL.points) == len(MODEL.weights) == 24
     assert MODEL.gram[:2, :2] == pytest.approx(R * np.diag([1.5**2 * 16 / 15, 8 / 3]), abs=1e-15)
     eta = MODEL.points / R
     by_hand = np.stack([1.5 - 1.5 * eta**2, 2.0 * eta, 0.5 + 0.25 * eta - 0.75 * eta**3], axis=1)
@@ -143,7 +97,6 @@ def test_quadrature_and_profiles():
     at = np.column_stack([np.full(24, 0.2), MODEL.points])
     for profile, direction in zip(MODEL.profiles.T, MODEL.basis_fields, strict=True):
         np.testing.assert_allclose(direction(at), np.column_stack([profile, np.zeros(24)]), rtol=1e-12, atol=1e-15)
-    assert len(MODEL.basis_fields) == MODEL.n_parameters == MODEL.profiles.shape[1] == 3
 
 
 def best_fit(model, true, k):
@@ -174,52 +127,35 @@ def test_basis_of_the_skewed_pipe_holds_its_truth_well_but_not_exactly(k):
     np.testing.assert_allclose(model.weights @ model.profiles / (2.0 * R), [1.0, 0.0, 0.0], atol=1e-14)
 
 
-@pytest.mark.parametrize("exponent", [2.5, 3.0, 7.0, 10.0])
-def test_basis_of_the_round_pipe_is_near_its_truth_but_not_exact(exponent):
-    """Profiles between laminar and plug flow: the best fit has an error of 0.5 to 10 %, by the
-    parabola alone 3 to 10 times as much. (With m = 4 it is exact.) Its mean velocity is accurate to
-    3 %."""
-    true = RoundPipeFlow(4.5, R, exponent).profile(ROUND.points)
-    theta, error = best_fit(ROUND, true, 2)
-    assert 0.005 < error < 0.1 and 3.0 < best_fit(ROUND, true, 1)[1] / error < 11.0
-    assert theta[0] == pytest.approx(4.5, rel=0.03) and theta[1] > 0.0
-
-
 def test_quadrature_of_a_round_section_is_exact():
-    """∫ r^d dA = 2π R^(d+2)/(d + 2). The mean is 1 for the parabola and 0 for the quartic;
-    both rest on the wall. The mean velocity does not depend on the exponent."""
+    """∫ r^d dA = 2π R^(d+2)/(d + 2). The mean is 1 for the parabola and 0 for the quartic; both rest on the wall.
+
+    The mean velocity does not depend on the exponent. For profiles between laminar and plug flow the best fit has an
+    error of 0.5 to 10 %, by the parabola alone 3 to 10 times as much; its mean velocity is accurate to 3 %.
+    """
     for degree in range(40):
         exact = 2.0 * np.pi * R**(degree + 2) / (degree + 2)
         assert ROUND.weights @ ROUND.points**degree == pytest.approx(exact, rel=1e-13)
     np.testing.assert_allclose(ROUND.weights @ ROUND.profiles / (np.pi * R**2), [1.0, 0.0], atol=1e-14)
     for direction in ROUND.basis_fields:
         np.testing.assert_allclose(direction(np.array([[0.6 * R, -0.8 * R, 0.1]])), 0.0, atol=1e-14)
-    for exponent in (1.0, 2.0, 5.0, 10.0):
+    for exponent in (1.0, 2.0, 2.5, 3.0, 7.0, 10.0):
         profile = RoundPipeFlow(4.5, R, exponent).profile(ROUND.points)
         assert ROUND.weights @ profile == pytest.approx(4.5 * np.pi * R**2, rel=1e-13)
-
-
-def model_with(changes):
-    """Return a model of one profile with other arguments."""
-    return VelocityModel(**{"half_width": R, "basis": ((1.5, 0.0, -1.5),), "nominal": (4.5,),
-                            "initial_std": (1.0,), "walk_std": (0.02,)} | changes)
+        if exponent > 2.0:
+            theta, error = best_fit(ROUND, profile, 2)
+            assert 0.005 < error < 0.1 and 3.0 < best_fit(ROUND, profile, 1)[1] / error < 11.0
+            assert theta[0] == pytest.approx(4.5, rel=0.03) and theta[1] > 0.0
 
 
 @pytest.mark.parametrize(("make", "arguments", "message"), [
-    (PlaneChannelFlow, (-1.0, 0.05), "mean_velocity"), (PlaneChannelFlow, (4.5, 0.0), "half_width"),
-    (PowerLawFlow, (-1.0, 0.05), "mean_velocity"),
-    (PowerLawFlow, (4.5, 0.0), "half_width"), (PowerLawFlow, (4.5, 0.05, -0.1), "exponent"),
-    (RoundPipeFlow, (-1.0, 0.05), "mean_velocity"),
-    (RoundPipeFlow, (4.5, 0.0), "radius"), (SkewedChannelFlow, (4.5, 0.0), "half_width"),
-    (RoundPipeFlow, (4.5, R, 0.5), "exponent"),
+    (PlaneChannelFlow, (-1.0, 0.05), "mean_velocity"), (PowerLawFlow, (4.5, 0.05, -0.1), "exponent"),
+    (RoundPipeFlow, (4.5, 0.0), "radius"), (RoundPipeFlow, (4.5, R, 0.5), "exponent"),
     (SkewedChannelFlow, (4.5, R, 5.1), "skewness"),
     (MODEL.field, ([1.0, 2.0],), r"parameters must have shape \(3,\), got \(2,\)"),
     (MODEL.field, ([1.0, np.nan, 0.0],), "parameters must be finite"),
-    (model_with, ({"half_width": 0.0},), "half_width"),
-    (model_with, ({"nominal": (4.5, 0.0)},), r"nominal must have shape \(1,\), got \(2,\)"),
-    (model_with, ({"initial_std": ()},), "initial_std must have shape"),
-    (model_with, ({"walk_std": (np.inf,)},), "walk_std must be finite"),
-    (model_with, ({"initial_std": (-1.0,)},), "initial_std must be")])
+    (VelocityModel, (R, ((1.5, 0.0, -1.5),), (4.5, 0.0), (1.0,), (0.02,)), r"nominal must have shape \(1,\), got"),
+    (VelocityModel, (R, ((1.5, 0.0, -1.5),), (4.5,), (-1.0,), (0.02,)), "initial_std must be")])
 def test_errors_name_the_argument(make, arguments, message):
     """Numbers out of range are rejected by name; a model needs one number for each profile."""
     with pytest.raises(ValueError, match=message):

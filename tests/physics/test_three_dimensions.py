@@ -9,7 +9,6 @@ from eitbench.numerics.mesh import Mesh
 from eitbench.numerics.round_meshes import extrude
 from eitbench.physics.cem import CompleteElectrodeModel
 from eitbench.physics.flow import RoundPipeFlow
-from eitbench.physics.navier_stokes import steady_flow
 from eitbench.physics.transport import ConvectionDiffusion
 
 
@@ -69,9 +68,3 @@ def test_shear_disperses_as_taylor_and_aris_say():
     assert weights @ c == pytest.approx(start, rel=1e-5)                              # the slug is completely inside
     effective = (variance[-1] - variance[9]) / (2 * 4 * cd.time_step)
     assert effective == pytest.approx(D * (1 + 1 / 48 * (mean * a / D)**2), rel=0.01)
-
-
-def test_steady_flow_refuses_three_dimensions():
-    mesh = spherical_octant(np.array([1.0, 2.0]), 1)
-    with pytest.raises(ValueError, match="mesh must be 2D, got 3D"):
-        steady_flow(mesh, 1.0, [(mesh.boundary_facets, np.zeros_like)])

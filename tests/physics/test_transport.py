@@ -220,16 +220,12 @@ def test_fluid_enters_where_it_points_inwards():
 
 @pytest.mark.parametrize(("changes", "name"), [
     ({"diffusivity": 0.0}, "diffusivity"), ({"time_step": np.nan}, "time_step"), ({"substeps": 2.5}, "substeps"),
-    ({"inlet": np.array([91])}, "inlet"), ({"inlet": np.array([-1])}, "inlet"),
-    ({"velocity": uniform(np.nan, 0.0)}, "velocity"),
+    ({"inlet": np.array([91])}, "inlet"), ({"velocity": uniform(np.nan, 0.0)}, "velocity"),
     ({"velocity": lambda points: points[:, 0]}, "velocity"), ({"c": np.zeros(90)}, "^c "),
-    ({"c": np.zeros((2, 91))}, "^c "), ({"c": np.full(91, np.nan)}, "^c "),
-    ({"inflow_before": np.zeros(6)}, "inflow_before"),
-    ({"c": np.zeros((91, 2)), "inflow_after": np.zeros((7, 3))}, "inflow_after"),
-])
+    ({"c": np.full(91, np.nan)}, "^c "), ({"inflow_before": np.zeros(6)}, "inflow_before"),
+    ({"c": np.zeros((91, 2)), "inflow_after": np.zeros((7, 3))}, "inflow_after")])
 def test_errors_name_the_argument(changes, name):
-    """Numbers out of range, and fields, states and inflows that are not finite or have the wrong
-    shape, are rejected by name."""
+    """Numbers out of range, and fields, states and inflows not finite or of the wrong shape, are rejected by name."""
     state = {"c": np.zeros(91), "inflow_before": 0.0, "inflow_after": 0.0}
     settings = {"inlet": np.arange(7)} | {key: changes[key] for key in changes.keys() - state}
     with pytest.raises(ValueError, match=name):
@@ -348,16 +344,10 @@ def test_a_kink_counts_half_from_either_side():
 
 
 @pytest.mark.parametrize(("changes", "name"), [
-    ({"c": np.zeros(90)}, "^c "), ({"c": np.zeros((91, 2))}, "^c "),
-    ({"c": np.full(91, np.nan)}, "^c "),
-    ({"inflow_before": np.zeros(6)}, "inflow_before"),
-    ({"inflow_after": np.zeros((7, 2))}, "inflow_after"),
-    ({"directions": [PARABOLA, lambda points: points[:, 0]]}, r"directions\[1\]"),
-    ({"directions": [lambda points: points * np.nan]}, r"directions\[0\]"),
-    ({"directions": []}, "^directions"),
-])
+    ({"c": np.zeros((91, 2))}, "^c "), ({"directions": []}, "^directions"),
+    ({"directions": [PARABOLA, lambda points: points[:, 0]]}, r"directions\[1\]")])
 def test_errors_of_derivatives_name_the_argument(changes, name):
-    """States, inflows and directions of the wrong shape, or not finite, are rejected by name."""
+    """Several states, no direction and directions of the wrong shape are rejected by name."""
     state = {"c": np.zeros(91), "inflow_before": 0.0, "inflow_after": 0.0}
     with pytest.raises(ValueError, match=name):
         build(eddy).velocity_derivatives(**state | {"directions": [PARABOLA]} | changes)

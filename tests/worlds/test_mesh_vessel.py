@@ -49,7 +49,7 @@ def files(tmp_path_factory):
 @pytest.fixture
 def vessel(files):
     (fine, fine_hash, _), (coarse, coarse_hash, _) = files["fine"], files["coarse"]
-    return RoundMeshVessel(fine, fine_hash, coarse, coarse_hash, 8)
+    return RoundMeshVessel(fine, fine_hash.upper(), coarse, coarse_hash, 8)
 
 
 def test_electrodes_are_those_of_the_groups(files, vessel):
@@ -97,7 +97,7 @@ def test_a_world_with_it_runs(files, vessel, monkeypatch, tmp_path):
 def test_another_file_is_refused(files, vessel):
     """The world identifies the file by its hash; a missing group is named."""
     changed = RoundMeshVessel(files["fine"][0], "0" * 64, *files["coarse"][:2], 8)
-    with pytest.raises(ValueError, match=r"fine\.msh: must be the file with SHA-256 0000"):
+    with pytest.raises(ValueError, match=rf"fine\.msh: must be the file with SHA-256 0000.*, got .*{files['fine'][1]}"):
         changed.transport_mesh(True)
     few = RoundMeshVessel(*files["fine"][:2], *files["coarse"][:2], 7)
     with pytest.raises(ValueError, match=r"n_electrodes must be 8, the number of groups in .*, got 7"):

@@ -1,7 +1,6 @@
 """Bodies that move by themselves or rise through a pipe: their paths, their visits, the motion of the filter, and an
 instrument that measures a few electrodes."""
 
-from dataclasses import replace
 from functools import lru_cache
 
 import numpy as np
@@ -134,15 +133,6 @@ def test_bubbles_cross_the_pipe_faster_than_the_flow():
     assert np.mean(slips) == pytest.approx(0.275, abs=0.025)
     # a wait ends at the next step: half a step longer in the mean
     assert np.mean(waits) == pytest.approx(0.2 + 0.5 * DT, rel=0.1)
-
-
-def test_truth_has_a_finer_electrode_mesh_on_request():
-    coarse, fine = (replace(FEW_CELLS.vessel, electrodes_per_wall=2, truth_refinement=refinement)
-                    for refinement in (1, 2))
-    nodes = [vessel.electrode_model(True).mesh.n_nodes for vessel in (coarse, fine)]
-    assert 3.5 < nodes[1] / nodes[0] < 4.5
-    assert (fine.electrode_model(False).mesh.n_nodes
-            == coarse.electrode_model(False).mesh.n_nodes < nodes[0])
 
 
 def test_particles_move_with_the_flow_and_stay_in_the_pipe():

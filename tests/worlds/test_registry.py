@@ -58,8 +58,7 @@ def test_a_world_runs_under_its_id():
     assert entry(ID) == registry.Entry(ID, QUIET, "estimation", {"lag": 1}, "Nothing happens.")
     env = gym.make(ID)
     base = env.unwrapped
-    assert base.world is QUIET
-    assert base.lag == 1
+    assert base.world is QUIET and base.lag == 1
     env.reset(seed=3)
     rewards = [env.step(np.full(base.n_nodes, 30.0))[1] for _ in range(QUIET.n_steps + 1)]
     np.testing.assert_allclose(rewards, 0.0, atol=1e-9)
@@ -91,8 +90,7 @@ def test_an_id_belongs_to_one_world():
 
 
 @pytest.mark.parametrize(("id", "settings", "message"), [
-    *((id, {}, "id must look like 'namespace/Name-v0', got")
-      for id in ("Quiet-v0", "mine/Quiet", "mine/a/Quiet-v0", "mine/Quiet-v0 ", "")),
+    *((id, {}, "id must look like 'namespace/Name-v0', got") for id in ("Quiet-v0", "mine/Quiet", "mine/a/Quiet-v0")),
     (ID, {"gate": 3.0}, "settings of the track estimation must be among lag, assume; got gate"),
     (ID, {"track": "injection", "lag": 3, "assume": {}},
      "settings of the track injection must be among gate, inflow, faults, history; got assume, lag"),
@@ -104,12 +102,6 @@ def test_a_rejected_registration_has_no_effect(id, settings, message):
     with pytest.raises(ValueError, match=message):
         register(QUIET, id, **settings)
     assert id not in entries() and id not in gym.registry and not hands()
-
-
-def test_an_id_that_nobody_registered_is_named():
-    """The message lists the most similar ids."""
-    with pytest.raises(ValueError, match=r"env must be one of eitbench/.*, … \([0-9]+ in all\); got 'mine/"):
-        entry(ID)
 
 
 def test_the_last_registration_is_used():
@@ -148,25 +140,10 @@ def test_modules_of_entry_points_are_imported(monkeypatch, tmp_path):
     assert not hands()
 
 
-def test_groups_and_starting_points():
-    """Each built-in id is in a group; seven are recommended to begin with."""
-    own = [each for id, each in entries().items() if id.startswith("eitbench/")]
-    assert {each.group for each in own} == set(registry.GROUPS) - {"user-defined"}
-    assert sum(each.is_starting_point for each in own) == 7
-    assert all((each.group == "robustness variants") == bool(each.nominal) for each in own)
-    assert all((each.group == "injection") == (each.track == "injection") for each in own)
-    register(QUIET, ID)
-    assert entry(ID).group == "user-defined"
-
-
-VARIANTS = {"short-slugs", "strong-slugs", "double-noise", "other-velocity", "other-contacts", "other-inlet"}
-
-
 @pytest.mark.parametrize("id", [id for id, each in entries().items() if each.nominal])
 def test_a_variant_is_the_environment_of_its_id(id):
     """The world is the same object; the nominal id alone gives the nominal world."""
     each = entry(id)
-    assert each.variant in VARIANTS
     env = gym.make(each.nominal, variant=each.variant).unwrapped
     other = gym.make(id).unwrapped
     assert env.world is other.world is each.world and env.lag == other.lag
@@ -179,8 +156,7 @@ def test_a_variant_is_the_environment_of_its_id(id):
 @pytest.mark.parametrize(("id", "variant", "message"), [
     ("eitbench/Pipe2D-v0", "strong-slug", r"variant of .*Pipe2D-v0 must be one of short-slugs, strong-slugs, .*; "
      r"got 'strong-slug'. Did you mean strong-slugs\?"),
-    ("eitbench/Pipe3D-v0", "strong-slugs", "eitbench/Pipe3D-v0 has no variants, got 'strong-slugs'"),
-    ("eitbench/Pipe2DInjection-v0", "x", "eitbench/Pipe2DInjection-v0 has no variants, got 'x'")])
+    ("eitbench/Pipe3D-v0", "strong-slugs", "eitbench/Pipe3D-v0 has no variants, got 'strong-slugs'")])
 def test_an_unknown_variant_is_rejected(id, variant, message):
     """The message lists the variants."""
     with pytest.raises(ValueError, match=message):

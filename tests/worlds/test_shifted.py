@@ -48,7 +48,6 @@ def test_the_task_is_that_of_home(id):
     ("me/Shift-v0", {}, SHIFTS[0], "nominal must be a registered id that is not shifted itself"),
     ("me/Shift-v0", {"instrument": {"noise_relative": 0.02}}, NOMINAL_ID, "me/Shift-v0 and .* differ in noise$"),
     ("me/Shift-v0", {"schedule": {"scored_steps": 9}}, NOMINAL_ID, "differ in schedule, steps$"),
-    ("me/Shift-v0", {"prior": {"nodal_std": 0.1}}, NOMINAL_ID, "differ in prior$"),
     ("me/Shift-v0", {}, "eitbench/Pipe2DFixedLag-v0", "differ in settings$"),
     ("me/Shift-v0", {}, "eitbench/Pipe2DInjection-v0", "differ in track$"),
 ])

@@ -20,14 +20,13 @@ SHORT = ROTATING.with_changes({"schedule": {"warm_up": 1, "scored_steps": 3}, "v
 STILL = STATIONARY.with_changes({"schedule": {"scored_steps": 4}})
 
 
-@pytest.mark.parametrize(("n_electrodes", "cover"), [(16, 0.5), (7, 0.8), (4, 0.05)])
+@pytest.mark.parametrize(("n_electrodes", "cover"), [(16, 0.5), (7, 0.8)])
 def test_electrodes_lie_where_the_spans_say(n_electrodes, cover):
     """Each electrode has ``cells_at_electrodes`` facets, chords of its arc that end at its edges."""
     tank = RoundTank(n_electrodes=n_electrodes, electrode_coverage=cover)
     spans, R = tank.electrode_spans, tank.radius
-    np.testing.assert_allclose((spans[:, 1] - spans[:, 0]).sum(), 2.0 * np.pi * cover, rtol=1e-12)
     middles = 2.0 * np.pi * np.arange(n_electrodes) / n_electrodes
-    np.testing.assert_allclose(spans.mean(axis=1), middles, atol=1e-12)
+    np.testing.assert_allclose(spans, middles[:, None] + np.pi * cover / n_electrodes * np.array([-1, 1]), atol=1e-12)
     mesh = electrode_disc(R, spans, 6, 12)
     electrodes = tank.electrodes(mesh)
     assert len(electrodes) == n_electrodes
@@ -37,28 +36,20 @@ def test_electrodes_lie_where_the_spans_say(n_electrodes, cover):
         middle = 0.5 * (first + last)
         angle = np.mod(np.arctan2(ends[..., 1], ends[..., 0]) - middle + np.pi, 2.0 * np.pi) - np.pi
         np.testing.assert_allclose([angle.min(), angle.max()], [first - middle, last - middle], atol=1e-9)
-        chords = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1)
-        np.testing.assert_allclose(chords, 2.0 * R * np.sin(0.5 * np.ptp(angle, axis=1)), rtol=1e-9)
         assert np.ptp(angle, axis=1).sum() == pytest.approx(last - first, rel=1e-9)  # without overlap
         assert len(facets) == 6
-    assert len(np.unique(np.concatenate(electrodes), axis=0)) == 6 * n_electrodes
-
-
-def test_flow_rests_on_the_wall():
-    """The flow has no slip at wall nodes and facet midpoints; the largest speed is half a metre per second."""
-    flow = ROTATING.flow.nominal(ROTATING, fine=True)
-    ends = flow.mesh.points[flow.mesh.boundary_facets]
-    for points in (ends[:, 0], ends.mean(axis=1)):
-        np.testing.assert_allclose(flow(points), 0.0, atol=1e-12)
-    assert 0.5 < np.linalg.norm(flow(flow.mesh.points), axis=1).max() < 1.0
 
 
 def test_ball_goes_round_on_an_orbit_of_the_flow():
     """The centre moves with the mean velocity over the disc: an integral over 192 points, solved to high accuracy.
 
-    In 2 s, or 1 m, the error of the path is at most 1 mm, a twentieth of the ball's radius.
+    In 2 s, or 1 m, the error of the path is at most 1 mm, a twentieth of the ball's radius. The flow is at rest at wall
+    nodes and facet midpoints; the largest speed is half a metre per second.
     """
     flow, a = ROTATING.flow.nominal(ROTATING, fine=True), ROTATING.target.radius
+    ends = flow.mesh.points[flow.mesh.boundary_facets]
+    np.testing.assert_allclose(flow(np.concatenate([ends[:, 0], ends.mean(axis=1)])), 0.0, atol=1e-12)
+    assert 0.5 < np.linalg.norm(flow(flow.mesh.points), axis=1).max() < 1.0
     path = ROTATING.target.path(ROTATING, episode_streams(1).flow).centres
     s, weights = np.polynomial.legendre.leggauss(8)
     angle = 2.0 * np.pi * np.arange(24) / 24
@@ -155,7 +146,6 @@ def test_cylinders_hold_their_metal_and_do_not_move():
 def test_frame_of_the_tank_at_rest_measures_sixteen_things():
     """Sixteen different injections, eight of them opposite, span all fifteen dimensions of zero sum."""
     currents = STATIONARY.currents
-    assert currents.shape == (16, 16) and len(np.unique(currents, axis=0)) == 16
     np.testing.assert_array_equal(np.sort(currents, axis=1)[:, [0, -1]], [[-0.1, 0.1]] * 16)
     np.testing.assert_array_equal((currents != 0).sum(axis=1), 2)
     assert np.linalg.matrix_rank(currents) == 15

@@ -19,9 +19,9 @@ from eitbench.worlds.catalogue import (
 from eitbench.worlds.catalogue import PIPE_2D_TIME_VARYING as DRAWN
 from eitbench.worlds.flows import NoFlow
 from eitbench.worlds.random_streams import episode_streams, generator_from_state
-from eitbench.worlds.vessels import Bulge, PlanePipe, RoundTank
+from eitbench.worlds.vessels import Bulge, PlanePipe
 
-SMALL_3D = dataclasses.replace(PIPE_3D.vessel, electrode_rings=2, electrodes_per_ring=4)
+SMALL_3D = dataclasses.replace(PIPE_3D.vessel, electrode_rings=1, electrodes_per_ring=6)
 
 
 def test_only_what_is_named_changes():
@@ -34,10 +34,7 @@ def test_only_what_is_named_changes():
     assert world.instrument.noise_relative == 0.02
     assert world.vessel is PIPE_2D.vessel
     assert world.schedule is PIPE_2D.schedule
-    assert world.name == PIPE_2D.name
-    assert PIPE_2D.target.log_amplitude == (0.22, 0.40)
     assert PIPE_2D.with_changes(None) is PIPE_2D
-    assert PIPE_2D.with_changes({}) == PIPE_2D
     back = world.with_changes({"target": {"log_amplitude": [0.22, 0.40], "arrivals": {"interval": 0.02}},
                           "instrument": {"noise_relative": 0.01}})
     assert back == PIPE_2D
@@ -48,15 +45,7 @@ def test_only_what_is_named_changes():
 def test_every_number_can_be_named(id):
     """Overrides with present values change nothing; a copy from another process is equal."""
     world = entries()[id].world
-
-    def numbers(part) -> dict:
-        found = {}
-        for each in dataclasses.fields(part):
-            value = getattr(part, each.name)
-            found[each.name] = numbers(value) if dataclasses.is_dataclass(value) else value
-        return found
-
-    changes = numbers(world)
+    changes = dataclasses.asdict(world)
     del changes["name"]
     again = world.with_changes(changes)
     assert again == world
@@ -71,54 +60,33 @@ def test_every_number_can_be_named(id):
     (PIPE_2D, [1], r"^world must be a dict of parts and their numbers, got \[1\]"),
     (PIPE_2D, {"vessel": {"radius": 1.0}}, "^world.vessel has no 'radius'; there are length, half_width"),
     (PIPE_2D, {"vessel": {"length": "far"}}, "^world.vessel: length must be a number in m, got 'far'"),
-    (PIPE_2D, {"vessel": {"electrodes_per_wall": 2.5}}, "^world.vessel: electrodes_per_wall must be an int"),
-    (PIPE_2D, {"flow": {"mean_velocity": 0.0}}, "^world.flow: mean_velocity must be a finite number"),
-    (PIPE_2D, {"target": {"transverse_std": [0.02, 0.01]}}, "^world.target: transverse_std must be a range"),
     (PIPE_2D, {"target": {"arrivals": {"interval": 0.0}}}, "^world.target.arrivals: interval must be"),
     (PIPE_2D, {"target": {"radial_range": [0.5, 1.1]}}, "^world.target: radial_range must end above 0"),
-    (PIPE_2D, {"instrument": {"noise_relative_to_max": 0.0}}, "noise_relative_to_max must be a finite number in"),
-    (PIPE_2D, {"instrument": {"noise_mismatch": -1.0}}, "^world.instrument: noise_mismatch must be a finite number in"),
     (PIPE_2D, {"instrument": {"n_dead_range": [8, 8], "n_failing_range": [7, 7]}}, "electrodes without fault"),
     (PIPE_2D, {"schedule": {"time_step": float("nan")}}, "^world.schedule: time_step must be"),
     (PIPE_2D, {"region": [0.0, 0.5]}, "region must be a range 0 ≤ begin < end ≤ 0.4 m"),
     (DRAWN, {"flow": {"velocity_range": (5.0, 4.0)}}, "^world.flow: velocity_range must be a range low ≤ high"),
-    (DRAWN, {"flow": {"velocity_range": 4.5}}, r"velocity_range must have shape \(2,\)"),
     (DRAWN, {"flow": {"oscillation_range": (0.5, 1.0)}}, "^world.flow: oscillation_range must lie below 1"),
-    (DRAWN, {"flow": {"period_range": (0.0, 0.4)}}, "^world.flow: period_range must be"),
     (DRAWN, {"flow": {"skewness_range": (0.6, 5.5)}}, "skewness_range below 5"),
-    (DRAWN, {"flow": {"velocity_std": -1.0}}, "^world.flow: velocity_std must be"),
-    (PIPE_3D, {"vessel": {"electrode_rings": 0}}, "^world.vessel: electrode_rings must"),
     (PIPE_3D, {"vessel": {"electrode_length": 0.2}}, "^world.vessel: electrode_length must leave gaps"),
-    (PIPE_3D, {"vessel": {"potential_order": 3}}, "^world.vessel: potential_order must"),
-    (ROTATING_TANK_2D, {"vessel": {"radius": 0.0}}, "^world.vessel: radius must be"),
     (ROTATING_TANK_2D, {"vessel": {"electrode_coverage": 1.0}}, "electrode_coverage"),
     (ROTATING_TANK_2D, {"flow": {"stirrer_position": (np.nan, 0.0)}}, "stirrer_position must be"),
     (ROTATING_TANK_2D, {"target": {"initial_radius_range": (0.5, 0.9)}}, "range .* keeps the disc"),
     (STATIONARY_TANK_2D, {"vessel": {"n_electrodes": 7}}, "n_electrodes must be an integer of at least 8"),
     (STATIONARY_TANK_2D, {"target": {"min_gap": 0.12}}, "min_gap must leave room"),
     (STATIONARY_TANK_2D, {"target": {"max_centre_radius": 0.8}}, "max_centre_radius must be"),
-    (STATIONARY_TANK_2D, {"target": {"concentration_ratio": 0.0}}, "^world.target: concentration_ratio must be"),
     (STATIONARY_TANK_2D, {"target": {"small_radius": (0.018, 0.035)}}, "small_radius must not reach beyond large"),
-    (STATIONARY_TANK_2D, {"target": {"small_radius": 0.02}}, r"small_radius must have shape \(2,\)"),
     (TANK_TRACKING, {"target": {"radius_range": (0.01, 0.2)}}, "radius_range must end below half of the radius"),
-    (TANK_TRACKING, {"target": {"speed_range": (0.3, 0.1)}}, "speed_range must be a range"),
-    (TANK_TRACKING, {"target": {"run_time": 0.0}}, "run_time must be"),
-    (TANK_TRACKING, {"target": {"visit_time": -1.0}}, "visit_time must be"),
     (TANK_TRACKING, {"instrument": {"readings": "some"}}, "readings must be one of all, neighbours, chosen"),
-    *((TANK_TRACKING, {"instrument": {"readings": "chosen", "n_voltmeters": n}},
-       f"n_voltmeters must be an integer of at least 1 and at most 16, got {n}") for n in (0, 17, 1.5)),
+    (TANK_TRACKING, {"instrument": {"readings": "chosen", "n_voltmeters": 17}},
+     "n_voltmeters must be an integer of at least 1 and at most 16, got 17"),
     (TANK_TRACKING, {"instrument": {"readings": "chosen", "current_norm": "L1"}},
      "current_norm must be None with the readings 'chosen', got 'L1'"),
     (BUBBLE_TRACKING, {"target": {"radius_range": (0.01, 0.045)}}, "radius_range and amplitude_range must have a sum"),
-    (BUBBLE_TRACKING, {"target": {"slip_range": (0.3, 0.1)}}, "slip_range must be a range"),
-    (BUBBLE_TRACKING, {"target": {"mean_wait": 0.0}}, "mean_wait must be"),
     (BUBBLE_TRACKING, {"vessel": PlanePipe(bulge=Bulge())}, "target must be in a PlanePipe without a bulge"),
-    (BUBBLE_TRACKING, {"vessel": RoundTank()}, "target must be in a PlanePipe without a bulge"),
     (BUBBLE_TRACKING, {"flow": NoFlow()}, "flow must be a flow through the pipe"),
-    *((BUBBLE_TRACKING, {"target": {"n_bodies": n}},
-       f"n_bodies must be an integer of at least 1 and at most 4, got {n}") for n in (0, 5, 1.5)),
-    *((PIPE_2D_TURBULENT, {"flow": change}, next(iter(change))) for change in (
-        {"intensity": -0.1}, {"profile": "plug"}, {"n_modes": 0}, {"integral_scale": 0.0})),
+    (BUBBLE_TRACKING, {"target": {"n_bodies": 5}}, "n_bodies must be an integer of at least 1 and at most 4, got 5"),
+    (PIPE_2D_TURBULENT, {"flow": {"profile": "plug"}}, "profile"),
 ], ids=str)
 def test_what_is_wrong_is_named(world, changes, message):
     """The message contains the part, the field, the value and the allowed range."""
