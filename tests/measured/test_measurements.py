@@ -110,9 +110,6 @@ def test_large_files_are_memory_mapped(tmp_path, monkeypatch):
     assert not long.voltages.flags.writeable
     np.testing.assert_array_equal(short_voltages, long_voltages)
     np.testing.assert_array_equal(long.voltages[48_000:48_480], short.voltages)
-    part = read(paths[1], steps=slice(48_000, 48_480))
-    np.testing.assert_array_equal(part.voltages, short.voltages)
-    assert part.times[0] == 480.0
     with pytest.raises(ValueError, match=r"large.h5.*steps must select some of the 144000 measurement vec"):
         read(paths[1], steps=slice(2_000_000, None))
 

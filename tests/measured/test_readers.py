@@ -190,7 +190,7 @@ DESCRIPTION = {"electrodes": 8, "current": 0.001}
 
 
 @pytest.mark.parametrize(("titles", "first"), [
-    ("", "{:d}.0"), ("", "{:d}.000e+00"), ("source,sink," + ",".join(f"ch-{k}" for k in range(1, 9)), "{:d}"),
+    ("", "{:d}.000e+00"), ("source,sink," + ",".join(f"ch-{k}" for k in range(1, 9)), "{:d}"),
     ("I+,I-," + ",".join(f"U{k}" for k in range(1, 9)), "{:d}")])
 def test_tables_of_potentials(tmp_path, titles, first):
     """Numbers with a decimal point are not titles, and a "-" in a title is not a difference."""
