@@ -142,10 +142,6 @@ class QuadraticModel:
     def linearise(self, concentration, currents):
         return (self.voltages(concentration, currents), np.einsum("j,jlm,km->klj", 2 * concentration, self.T, currents))
 
-    def homogeneous(self, level, currents):
-        voltages = self.voltages(np.full(len(self.T), level), currents)
-        return voltages, 2.0 * voltages
-
 
 @lru_cache(maxsize=1)
 def tiny_task():

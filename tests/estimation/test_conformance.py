@@ -91,7 +91,6 @@ def velocity():
 
 FORMS = [low_rank, dense_changing, modal, inflow_window, velocity]
 every = pytest.mark.parametrize("form", FORMS)
-nodal_forms = pytest.mark.parametrize("form", [low_rank, dense_changing])
 
 
 def measured(filter_, models, m=3, noise=(0.1, 1.0), root=False):
@@ -204,7 +203,7 @@ def test_iteration_changes_nothing_for_linear_models(form):
     assert_close(again.covariance.diagonal(), once.covariance.diagonal())
 
 
-@nodal_forms
+@pytest.mark.parametrize("form", [low_rank, dense_changing])
 def test_smoothed_means(form):
     filter_, models = form()
     seen, of_state = measured(filter_, models)

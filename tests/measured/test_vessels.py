@@ -102,7 +102,7 @@ def test_unified_files(tmp_path):
     np.testing.assert_allclose(measurements.times, [0, 30, 60, 90])
     for text, message in ((unified([(1, 2, 3, 13, 5.0, 1)]), "electrodes from 1 to 12, got 1 to 13"),
                           (unified(rows).replace(" r ", " rhoa "), "unified format: .*KeyError: 'r'"),
-                          (unified(rows, 11), "must have the 12 electrodes"), ("", "unified format")):
+                          (unified(rows, 11), "must have the 12 electrodes")):
         (tmp_path / "02.dat").write_text(text)
         with pytest.raises(ValueError, match=message):
             read(tmp_path)
