@@ -41,9 +41,9 @@ def seen(core, b=0):
     return {name: array[b] for name, array in core.observe().items()}
 
 
-def believed(id=ID, rules=None):
+def believed(id=ID):
     """Return a core after the first frame of an episode and the belief of its observation."""
-    core = InjectionCore(rules or rules_of(id), "reduced")
+    core = InjectionCore(rules_of(id), "reduced")
     core.reset([3])
     return core, BodyBelief(core.rules, seen(core))
 

@@ -52,12 +52,13 @@ def low_rank():
 
 
 def dense_changing():
-    """Return a filter with F as a matrix or as a callable, in turn."""
+    """Return a filter with F as a matrix or as a callable, in turn, and at rest in the fifth step."""
     models = [random_model(np.random.default_rng(seed)) for seed in range(T)]
+    models[4] = models[4]._replace(F=np.eye(14), s=np.zeros(14), Q=np.zeros((14, 14)))
 
     def motion(time):
         F, s, Q = models[time - 1][:3]
-        return Motion(F if time % 2 else lambda X: F @ X, s, Q)
+        return Motion() if time == 5 else Motion(F if time % 2 else lambda X: F @ X, s, Q)
 
     return Filter(NodalStates(models[0].mean, DenseCovariance(models[0].covariance), motion)), models
 

@@ -8,7 +8,6 @@ import pytest
 import scipy.optimize
 from eitbench import make_task
 from eitbench.bench.methods import load_method
-from eitbench.data.episode_cache import cached_episode, cycle_voltages
 from eitbench.estimation import (
     best_homogeneous,
     full_window_filter,
@@ -19,7 +18,7 @@ from eitbench.estimation import (
 )
 from eitbench.numerics.mesh import rectangle_mesh
 from eitbench.worlds.catalogue import PIPE_2D
-from models import tiny_prior, tiny_task
+from models import tiny_prior, tiny_record, tiny_task
 from test_gauss_newton import Linear, small_tank
 
 from short import TINY
@@ -138,8 +137,7 @@ def test_ensemble_smoother_has_the_most_probable_inflow():
     """Mean and variance agree with the maximum of the posterior density and the Laplace approximation there, but for
     the sampling error of the ensemble."""
     task, prior, c_ref = tiny_task(), tiny_prior(), 29.0
-    currents = TINY.currents[np.arange(TINY.n_steps) % len(TINY.currents)]
-    record = [*zip(cycle_voltages(TINY, 0, cached_episode(TINY, 0)), currents, strict=True)]
+    record = tiny_record()
     record[1][0][2] = np.nan
     module = load_method("ensemble_smoother", "estimation").make.start.__globals__
     found = module["smooth"](task, prior, c_ref, record)

@@ -4,7 +4,6 @@ of their samples."""
 import numpy as np
 import pytest
 from eitbench.bench.methods import baseline_folder
-from eitbench.data.episode_cache import cached_episode, cycle_voltages
 from eitbench.data.episodes import cached_truth_model, simulate
 from eitbench.estimation import (
     Filter,
@@ -20,18 +19,13 @@ from eitbench.worlds.catalogue import PIPE_2D_OBSTACLE
 from eitbench.worlds.catalogue import ROTATING_TANK_2D as ROTATING_TANK
 from eitbench.worlds.task import make_task
 from models import tiny_prior as prior
+from models import tiny_record
 from models import tiny_task as task
 from scipy.linalg import toeplitz
 
 from short import TINY
 
 LEVEL = 29.0
-
-
-def record():
-    """Return (voltages, currents) of five injections."""
-    voltages = cycle_voltages(TINY, 0, cached_episode(TINY, 0))
-    return [*zip(voltages, TINY.currents[np.arange(TINY.n_steps) % len(TINY.currents)], strict=True)]
 
 
 def window(link="logarithm", lag=0, law=None):
@@ -98,7 +92,7 @@ def test_prediction_keeps_the_prior():
 def test_map_estimate_maximises_the_density():
     """Steps in ten random directions, and the result of the linear smoother, have a lower density, also if a reading
     of an injection is missing."""
-    measurements = record()
+    measurements = tiny_record()
     measurements[1][0][2] = np.nan
     smoother = full_window_filter(task(), prior(), LEVEL, measurements)
     first, space = smoother.mean.copy(), smoother.space

@@ -96,8 +96,8 @@ def test_a_span_changes_the_digest(folder):
 
 
 @pytest.mark.parametrize(("change", "message"), [
-    ({"licence": ""}, "case.licence"), ({"sha256": "abc"}, "case.sha256"), ({"vessel": 3}, "case.vessel"),
-    ({"title": date(2023, 1, 1)}, r"a\.yml: case: Unsupported type: 'date'"), ({"span": "0:800"}, r"case\.span"),
+    ({"licence": ""}, "case.licence"), ({"sha256": "abc"}, "case.sha256"),
+    ({"title": date(2023, 1, 1)}, r"a\.yml: case: Unsupported type: 'date'"),
     ({"span": [9, 4]}, r"case\.span: must be two increasing numbers, got \[9, 4\]"),
     ({"frames": 3}, "case: .*'frames' was unexpected"),
     ({"auxiliary_files": {"ref.mat": "1"}}, "case.auxiliary_files.ref.mat")])
