@@ -5,6 +5,7 @@ from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
+from eitbench.data.episode_cache import cached_episode, cycle_voltages
 from eitbench.estimation import (
     Filter,
     InflowPrior,
@@ -142,14 +143,16 @@ class QuadraticModel:
     def linearise(self, concentration, currents):
         return (self.voltages(concentration, currents), np.einsum("j,jlm,km->klj", 2 * concentration, self.T, currents))
 
-    def homogeneous(self, level, currents):
-        voltages = self.voltages(np.full(len(self.T), level), currents)
-        return voltages, 2.0 * voltages
-
 
 @lru_cache(maxsize=1)
 def tiny_task():
     return make_task(TINY)
+
+
+def tiny_record():
+    """Return (voltages, currents) of five injections in the tiny world."""
+    voltages = cycle_voltages(TINY, 0, cached_episode(TINY, 0))
+    return [*zip(voltages, TINY.currents[np.arange(TINY.n_steps) % len(TINY.currents)], strict=True)]
 
 
 @lru_cache(maxsize=2)

@@ -46,37 +46,21 @@ THETA = np.array([4.0, 0.5])
 KNOWN_FLOW = flow_prior(THETA, np.zeros(2), np.zeros(2))
 
 
-def nodal(covariance, motions):
-    """Return a filter of `NodalStates` with the motions of ``models``."""
-    def motion(time):
-        model = motions[time - 1]
-        return Motion(model.F, model.s, model.Q)
-    return Filter(NodalStates(motions[0].mean, covariance, motion))
-
-
 def low_rank():
     model = random_model(np.random.default_rng(3))
     return model.filter(), [model] * T
 
 
 def dense_changing():
+    """Return a filter with F as a matrix or as a callable, in turn, and at rest in the fifth step."""
     models = [random_model(np.random.default_rng(seed)) for seed in range(T)]
-    return nodal(DenseCovariance(models[0].covariance), models), models
+    models[4] = models[4]._replace(F=np.eye(14), s=np.zeros(14), Q=np.zeros((14, 14)))
 
+    def motion(time):
+        F, s, Q = models[time - 1][:3]
+        return Motion() if time == 5 else Motion(F if time % 2 else lambda X: F @ X, s, Q)
 
-def dense_by_columns():
-    """Return a filter with F as a callable."""
-    filter_, models = dense_changing()
-    motion = filter_.space.motion
-    space = NodalStates(models[0].mean, DenseCovariance(models[0].covariance),
-                        lambda time: motion(time)._replace(transition=lambda X: models[time - 1].F @ X))
-    return Filter(space), models
-
-
-def at_rest():
-    model = random_model(np.random.default_rng(5))
-    still = model._replace(F=np.eye(14), s=np.zeros(14), Q=np.zeros((14, 14)))
-    return Filter(NodalStates(still.mean, DenseCovariance(still.covariance), Motion())), [still] * T
+    return Filter(NodalStates(models[0].mean, DenseCovariance(models[0].covariance), motion)), models
 
 
 def modal():
@@ -106,9 +90,8 @@ def velocity():
     return Filter(space), [model] * T
 
 
-FORMS = [low_rank, dense_changing, dense_by_columns, at_rest, modal, inflow_window, velocity]
+FORMS = [low_rank, dense_changing, modal, inflow_window, velocity]
 every = pytest.mark.parametrize("form", FORMS)
-nodal_forms = pytest.mark.parametrize("form", [low_rank, dense_changing, dense_by_columns, at_rest])
 
 
 def measured(filter_, models, m=3, noise=(0.1, 1.0), root=False):
@@ -221,7 +204,7 @@ def test_iteration_changes_nothing_for_linear_models(form):
     assert_close(again.covariance.diagonal(), once.covariance.diagonal())
 
 
-@nodal_forms
+@pytest.mark.parametrize("form", [low_rank, dense_changing])
 def test_smoothed_means(form):
     filter_, models = form()
     seen, of_state = measured(filter_, models)

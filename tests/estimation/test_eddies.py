@@ -54,7 +54,7 @@ def test_propagation_has_the_moments_of_samples(task):
     Q = {name: np.linalg.cholesky(model[name] + 1e-12 * np.eye(len(model[name]))) for name in ("noise", "eddy_noise")}
     x, z, b = np.split(states, [n, n + q], axis=1)
     b = b @ model["eddy_transition"].T + random.normal(size=(len(b), p)) @ Q["eddy_noise"].T
-    y = np.array([InflowWindow.concentration(space, each) for each in x]) / 28.0 - 1.0
+    y = InflowWindow.concentration(space, x) / 28.0 - 1.0
     u = np.hstack([y @ space.response().basis, z])
     z = z @ model["transition"].T + np.einsum("sj,jqu,su->sq", b, space.products, u, optimize=True)
     z += METHOD.NOISE_FACTOR**0.5 * random.normal(size=(len(z), q)) @ Q["noise"].T

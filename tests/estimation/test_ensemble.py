@@ -12,11 +12,8 @@ from eitbench.estimation import (
     inflow_response,
     linearise_at_prediction,
 )
-from eitbench.worlds.task import make_task
 from models import MESH, averaged, coarse_prior, coarse_task, coarse_transport, flow_prior
 from models import textbook_update as textbook
-
-from short import TINY
 
 LEVEL = 29.0
 
@@ -89,6 +86,3 @@ def test_many_members_give_the_kalman_filter(monkeypatch):
 def test_invalid_arguments_are_rejected():
     with pytest.raises(ValueError, match="members must be"):
         ensemble(members=1)
-    with pytest.raises(ValueError, match="the prior must be for the task's inlet"):
-        EnsembleFilter(make_task(TINY), coarse_prior("linear"), LEVEL, ensemble().flow, 10, 2, np.random.default_rng(0),
-                       linearise_at_prediction(coarse_task()))

@@ -1,4 +1,4 @@
-"""Reduced response and quadratic voltages of the fast inflow filter agree with the exact ones, also in 3D."""
+"""Reduced response and quadratic voltages of the fast inflow filter agree with the exact ones."""
 
 from functools import lru_cache
 
@@ -12,18 +12,15 @@ from eitbench.estimation import (
     reduced_response,
     steady_response,
 )
-from eitbench.worlds.catalogue import PIPE_2D, PIPE_3D
+from eitbench.worlds.catalogue import PIPE_2D
 from eitbench.worlds.task import make_task
 from scipy.linalg import toeplitz
 
-WORLDS = {"2D": PIPE_2D, "3D": PIPE_3D.with_changes({"flow": {"mean_velocity": 36.0}})}
-"""A faster flow in 3D has a shorter impulse response."""
 
-
-@lru_cache(maxsize=2)
-def parts(name):
+@lru_cache(maxsize=1)
+def parts():
     """Return the task, the prior of the inflow's logarithm, and the impulse response."""
-    task = make_task(WORLDS[name])
+    task = make_task(PIPE_2D)
     return task, compatible_priors(baseline_folder() / "priors", task, "logarithm")[0], steady_response(task.transport)
 
 
@@ -35,11 +32,10 @@ def states(response, prior, count=200, seed=0):
     return np.einsum("nq,qki,ckr,ir->cn", response.basis, response.weights, x, prior.modes, optimize=True)
 
 
-@pytest.mark.parametrize("name", ["2D", "3D"])
-def test_leading_directions_have_the_least_projection_error(name):
+def test_leading_directions_have_the_least_projection_error():
     """All directions reproduce the states; the projection error of 160 is at most 1e-3 of their squares, larger for
     fewer directions, and larger for other bases of the same size."""
-    _, prior, response = parts(name)
+    _, prior, response = parts()
     exact = states(response, prior)
     whole = reduced_response(response, prior, 10**6)
     np.testing.assert_allclose(states(whole, prior), exact, atol=1e-8 * np.abs(exact).max())
@@ -53,7 +49,7 @@ def test_leading_directions_have_the_least_projection_error(name):
 @lru_cache(maxsize=1)
 def fast():
     """Return the scaled quadratic voltages of the 2D pipe, and their 48 quadratic directions."""
-    task, prior, response = parts("2D")
+    task, prior, response = parts()
     basis = reduced_response(response, prior, 48).basis
     return task, basis, ScaledVoltageModel(task.observation, task.expected_concentration, basis)
 
@@ -72,7 +68,7 @@ def test_voltages_are_exact_at_any_c_ref():
             off[name].append(np.linalg.norm(model.voltages(c, task.currents) - exact) / np.linalg.norm(exact))
     assert max(off["scaled"]) < 1e-3
     assert min(off["plain"]) > 10 * max(off["scaled"])
-    _, prior, response = parts("2D")
+    _, prior, response = parts()
     errors = []
     for u in states(response, prior, count=12, seed=3):
         c = task.expected_concentration * np.exp(u)
@@ -95,19 +91,3 @@ def test_derivatives_of_voltages(model):
         ends = [voltages.voltages(c + sign * 1e-4 * way, task.currents[:3]) for sign in (1, -1)]
         expected = (ends[0] - ends[1]) / 2e-4
         np.testing.assert_allclose(slopes @ way, expected, atol=1e-6 * np.abs(expected).max())
-
-
-def test_every_pair_of_electrodes_is_contracted_once(monkeypatch):
-    """Contractions of all 120 pairs are computed once and stay in the cache."""
-    calls = []
-    real = QuadraticVoltageModel._contracted
-    monkeypatch.setattr(QuadraticVoltageModel, "_contracted",
-                        lambda self, currents: calls.append(1) or real(self, currents))
-    task, basis, _ = fast()
-    model = QuadraticVoltageModel(task.observation, task.expected_concentration, basis[:, :4])
-    pairs = np.eye(16)[:, None] - np.eye(16)
-    pairs = pairs[np.triu_indices(16, 1)]
-    c = np.full(task.mesh.n_nodes, task.expected_concentration)
-    first, again = (model.voltages(c, pairs) for _ in range(2))
-    np.testing.assert_array_equal(first, again)
-    assert len(pairs) == len(calls) == 120

@@ -8,7 +8,6 @@ import pytest
 import scipy.optimize
 from eitbench import make_task
 from eitbench.bench.methods import load_method
-from eitbench.data.episode_cache import cached_episode, cycle_voltages
 from eitbench.estimation import (
     best_homogeneous,
     full_window_filter,
@@ -19,7 +18,7 @@ from eitbench.estimation import (
 )
 from eitbench.numerics.mesh import rectangle_mesh
 from eitbench.worlds.catalogue import PIPE_2D
-from models import tiny_prior, tiny_task
+from models import tiny_prior, tiny_record, tiny_task
 from test_gauss_newton import Linear, small_tank
 
 from short import TINY
@@ -85,46 +84,37 @@ def recorded(method, n_steps, missing=None):
     return estimate, task, type(estimator).__init__.__globals__, c_ref, voltages, *at_reference
 
 
-def test_temporal_regularisation_conditions_one_gaussian_of_all_states():
-    """Mean and variance equal the stacked states' with covariance γ^|i−j| Γ, given the window and
-    its NaN."""
-    n_steps = 20
-    estimate, task, module, c_ref, voltages, computed, jacobian = recorded(
-        "temporal_regularisation", n_steps, (7, 3))
-    prior = smoothness_covariance(task.mesh, module["LENGTH"], module["STD"] * c_ref)
-    window = np.arange(n_steps - module["WINDOW"], n_steps)
-    kept = np.isfinite(voltages[window])
-    H, R = jacobian[window][kept], np.diag(task.noise.std(computed)[window][kept]**2)
-    times = np.repeat(window, kept.sum(axis=1))
-    decay = module["GAMMA"]**np.abs(times[:, None] - times)
-    S = decay * (H @ prior @ H.T) + R
-    cross = module["GAMMA"]**(n_steps - 1.0 - times)[:, None] * (H @ prior)
-    residual = (voltages - computed)[window][kept]
-    np.testing.assert_allclose(estimate.mean, c_ref + np.linalg.solve(S, residual) @ cross, rtol=1e-9)
-    expected = prior.diagonal() - (cross * np.linalg.solve(S, cross)).sum(axis=0)
-    np.testing.assert_allclose(estimate.variance, expected, rtol=1e-8)
+def decaying(module, c_ref):
+    """Return the terms of the covariance of x_i and x_j, γ^|i−j| Γ, as weights and standard deviations, and the number
+    of states."""
+    return [(lambda i, j: module["GAMMA"]**np.abs(i - j), module["STD"] * c_ref)], module["WINDOW"]
 
 
-def test_random_walk_filter_conditions_one_gaussian_of_all_states():
-    """Mean and variance equal x_0 + Σ e_i's, with a Matérn covariance of x_0 and each e_i."""
-    n_steps = 8
-    estimate, task, module, c_ref, voltages, computed, jacobian = recorded(
-        "random_walk_filter", n_steps)
-    step = smoothness_covariance(task.mesh, module["LENGTH"], module["STEP"] * c_ref)
-    initial = smoothness_covariance(task.mesh, module["LENGTH"], module["INITIAL_STD"] * c_ref)
-    H = jacobian.reshape(voltages.size, -1)
-    times = np.repeat(np.arange(1, n_steps + 1), voltages.shape[1])
-    shared = np.minimum(times[:, None], times)
-    S = H @ initial @ H.T + shared * (H @ step @ H.T) + np.diag(task.noise.std(computed).ravel()**2)
-    cross = H @ initial + times[:, None] * (H @ step)
-    solution = np.linalg.solve(S, (voltages - computed).ravel())
-    np.testing.assert_allclose(estimate.mean, c_ref + solution @ cross, rtol=1e-8)
-    reduction = (cross * np.linalg.solve(S, cross)).sum(axis=0)
-    expected = (initial + n_steps * step).diagonal() - reduction
-    np.testing.assert_allclose(estimate.variance, expected, rtol=1e-7)
+def walking(module, c_ref):
+    """Return the same for x_i = x_0 + e_1 + … + e_i, with a Matérn covariance of x_0 and each e_i."""
+    return [(lambda i, j: np.ones_like(i + j), module["INITIAL_STD"] * c_ref), (np.minimum, module["STEP"] * c_ref)], 8
 
 
-@pytest.mark.parametrize("factor", [0.25, 1.0, 3.0])
+@pytest.mark.parametrize(("method", "prior", "n_steps", "missing", "rtol"), [
+    ("temporal_regularisation", decaying, 20, (7, 3), 1e-9), ("random_walk_filter", walking, 8, None, 1e-8)])
+def test_filters_condition_one_gaussian_of_all_states(method, prior, n_steps, missing, rtol):
+    """Mean and variance of the last state are those given all measurements, or the window and its NaN."""
+    estimate, task, module, c_ref, voltages, computed, jacobian = recorded(method, n_steps, missing)
+    terms, states = prior(module, c_ref)
+    terms = [(weight, smoothness_covariance(task.mesh, module["LENGTH"], std)) for weight, std in terms]
+    kept = np.isfinite(voltages) & (np.arange(n_steps) >= n_steps - states)[:, None]
+    H, times = jacobian[kept], 1 + np.nonzero(kept)[0]
+    S = np.diag(task.noise.std(computed)[kept]**2)
+    S += sum(weight(times[:, None], times) * (H @ matrix @ H.T) for weight, matrix in terms)
+    cross = sum(weight(n_steps, times)[:, None] * (H @ matrix) for weight, matrix in terms)
+    solution = np.linalg.solve(S, (voltages - computed)[kept])
+    np.testing.assert_allclose(estimate.mean, c_ref + solution @ cross, rtol=rtol)
+    expected = sum(weight(n_steps, n_steps) * matrix.diagonal() for weight, matrix in terms)
+    expected -= (cross * np.linalg.solve(S, cross)).sum(axis=0)
+    np.testing.assert_allclose(estimate.variance, expected, rtol=10 * rtol)
+
+
+@pytest.mark.parametrize("factor", [0.25, 3.0])
 def test_adaptive_filter_finds_the_variance_of_the_inflow(factor):
     """If the task states ``factor`` times the standard deviation of the inflow, q becomes 1/factor²."""
     task, rng, c_ref = tiny_task(), np.random.default_rng(4), 28.0
@@ -147,8 +137,7 @@ def test_ensemble_smoother_has_the_most_probable_inflow():
     """Mean and variance agree with the maximum of the posterior density and the Laplace approximation there, but for
     the sampling error of the ensemble."""
     task, prior, c_ref = tiny_task(), tiny_prior(), 29.0
-    currents = TINY.currents[np.arange(TINY.n_steps) % len(TINY.currents)]
-    record = [*zip(cycle_voltages(TINY, 0, cached_episode(TINY, 0)), currents, strict=True)]
+    record = tiny_record()
     record[1][0][2] = np.nan
     module = load_method("ensemble_smoother", "estimation").make.start.__globals__
     found = module["smooth"](task, prior, c_ref, record)

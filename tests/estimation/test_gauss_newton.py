@@ -112,15 +112,10 @@ def test_steps_that_overshoot_are_halved():
     assert abs(found[0]) < 1e-6
 
 
-def quadratic():
-    return 6, QuadraticModel(np.random.default_rng(2))
-
-
-@pytest.mark.parametrize("make", [quadratic, small_tank])
-def test_noisy_voltages_give_the_weighted_least_squares_minimum(make):
+def test_noisy_voltages_give_the_weighted_least_squares_minimum():
     """The result is scipy's minimum of Σ((V − R(c·1))/std)² over one number, from a third, the same
     and three times the mean; the target is not homogeneous, and injections may repeat."""
-    n, model = make()
+    n, model = small_tank()
     rng, noise = np.random.default_rng(3), VoltageNoise(0.05, 0.01)
     currents = np.array([[1.0, -1.0, 0.0, 0.0], [0.0, 1.0, 0.0, -1.0], [1.0, 0.0, -1.0, 0.0], [1.0, -1.0, 0.0, 0.0]])
     voltages = model.voltages(rng.uniform(20.0, 40.0, n), currents)
@@ -139,16 +134,16 @@ def test_noisy_voltages_give_the_weighted_least_squares_minimum(make):
 
 def test_missing_convergence_is_an_error():
     """One iteration from a distant start raises an error with the last change and value."""
-    n, model = quadratic()
+    n, model = small_tank()
     currents = np.array([[1.0, -1.0, 0.0, 0.0]])
     voltages = model.voltages(np.full(n, 30.0), currents)
     with pytest.raises(RuntimeError, match=r"did not converge in 1 iterations; last change .* mol/m³"):
         best_homogeneous(model, VoltageNoise(), voltages, currents, 10.0, max_iterations=1)
 
 
-@pytest.mark.parametrize("lag", [0, 2])
-def test_updates_after_the_last_state_are_an_error(lag):
+def test_updates_after_the_last_state_are_an_error():
     """One update for each measurement, and one for each step of the lag; the next one names the limit."""
+    lag = 2
     task = replace(tiny_task(), lag=lag)
     estimator = load_method("homogeneous", "estimation").make(task)
     voltages = task.observation.voltages(np.full(task.mesh.n_nodes, 30.0), task.currents)

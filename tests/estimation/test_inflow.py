@@ -4,7 +4,6 @@ of their samples."""
 import numpy as np
 import pytest
 from eitbench.bench.methods import baseline_folder
-from eitbench.data.episode_cache import cached_episode, cycle_voltages
 from eitbench.data.episodes import cached_truth_model, simulate
 from eitbench.estimation import (
     Filter,
@@ -20,18 +19,13 @@ from eitbench.worlds.catalogue import PIPE_2D_OBSTACLE
 from eitbench.worlds.catalogue import ROTATING_TANK_2D as ROTATING_TANK
 from eitbench.worlds.task import make_task
 from models import tiny_prior as prior
+from models import tiny_record
 from models import tiny_task as task
 from scipy.linalg import toeplitz
 
 from short import TINY
 
 LEVEL = 29.0
-
-
-def record():
-    """Return (voltages, currents) of five injections."""
-    voltages = cycle_voltages(TINY, 0, cached_episode(TINY, 0))
-    return [*zip(voltages, TINY.currents[np.arange(TINY.n_steps) % len(TINY.currents)], strict=True)]
 
 
 def window(link="logarithm", lag=0, law=None):
@@ -98,7 +92,7 @@ def test_prediction_keeps_the_prior():
 def test_map_estimate_maximises_the_density():
     """Steps in ten random directions, and the result of the linear smoother, have a lower density, also if a reading
     of an injection is missing."""
-    measurements = record()
+    measurements = tiny_record()
     measurements[1][0][2] = np.nan
     smoother = full_window_filter(task(), prior(), LEVEL, measurements)
     first, space = smoother.mean.copy(), smoother.space
@@ -183,15 +177,13 @@ def test_inlets_are_compared_with_a_tolerance():
 @pytest.mark.parametrize(("call", "message"), [
     (lambda: InflowWindow(make_task(ROTATING_TANK), prior(), LEVEL),
      "the prior must be for the task's inlet, 0 nodes"),
-    (lambda: InflowPrior("log", prior().points, prior().modes, prior().correlation, 0.005),
-     "link must be one of linear, logarithm; got 'log'"),
     (lambda: InflowPrior("linear", prior().points, prior().modes, np.array([0.9, 0.1]), 0.005),
      "correlation must begin with 1"),
     (lambda: fit_inflow_prior(np.full((1, 40, 3), -1.0), np.zeros((3, 2)), 0.005),
      "ratios must be above 0, got -1"),
     (lambda: fit_inflow_prior(np.ones((1, 40, 3)), np.zeros((3, 2)), 0.005), "ratios must vary"),
     *((text, r"a\.json must be a prior of `eitbench fit prior`")
-      for text in ("", "[]", "{", '{"link": "linear"}', '{"link": 3}'))])
+      for text in ("{", '{"link": "linear"}'))])
 def test_invalid_arguments_and_files_are_rejected(call, message, tmp_path):
     if isinstance(call, str):
         (tmp_path / "a.json").write_text(call)

@@ -52,12 +52,9 @@ def test_field_is_a_matern_field_mirrored_at_the_walls():
         assert variance[node_at(mesh, x, y)] / variance[middle] == pytest.approx(factor, rel=0.01)
 
 
-@pytest.mark.parametrize(("length", "std", "message"), [
-    ("far", 1.0, "length must be a number in m"), (0.1, 0.0, "std must be"),
-])
-def test_errors_name_the_argument(length, std, message):
-    with pytest.raises(ValueError, match=message):
-        smoothness_covariance(uniform_disc(0.14, 2), length, std)
+def test_errors_name_the_argument():
+    with pytest.raises(ValueError, match="length must be a number in m"):
+        smoothness_covariance(uniform_disc(0.14, 2), "far", 1.0)
 
 
 C_BH = 32.0

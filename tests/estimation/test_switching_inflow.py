@@ -145,8 +145,6 @@ def test_invalid_arguments_are_rejected(tmp_path):
     with pytest.raises(ValueError, match="prior must have regimes"):
         plain = replace(prior(0.1, 0.1), correlation=np.ones(1), regimes=None)
         SwitchingInflowFilter(task(), plain, LEVEL, 0.1, linearise_at_prediction(task()))
-    with pytest.raises(ValueError, match="level_std must be"):
-        SwitchingInflowFilter(task(), prior(0.1, 0.1), LEVEL, 0.0, linearise_at_prediction(task()))
     with pytest.raises(ValueError, match="p_onset must be"):
         Regimes(0.0, 0.1, 0.1)
     with pytest.raises(ValueError, match="quiet_threshold must be exceeded in some steps only"):

@@ -52,9 +52,7 @@ def test_noise_is_estimated_from_repeats_and_from_frames_of_a_moving_target():
 
 @pytest.mark.parametrize(("voltages", "message"), [
     (-homogeneous(), "voltages must have the sign of the model's"),
-    (np.full((1, 8, 8), np.nan), "NaN only"),
     (np.zeros((1, 8, 8)), "voltages must differ from each other, got 0 V everywhere"),
-    (np.ones((1, 8, 7)), r"voltages must have shape \(any, 8, 8\)"),
 ])
 def test_invalid_voltages_are_rejected(voltages, message):
     with pytest.raises(ValueError, match=message):
@@ -72,13 +70,10 @@ DEAD[:, 4] = 0.5 * np.abs(homogeneous()).max() * np.random.default_rng(3).normal
 @pytest.mark.parametrize(("voltages", "currents", "matrix", "options", "warning"), [
     (homogeneous(noise=1e-3), CURRENTS, MATRIX, {}, ""),
     (homogeneous(), CURRENTS[:, SWAPPED], MATRIX[:, SWAPPED], {}, "Electrodes 2 and 6 seem to be swapped"),
-    (homogeneous(), CURRENTS[:, SWAPPED], MATRIX[:, SWAPPED], {"correction": "gain"},
-     "Electrodes 2 and 6 seem to be swapped"),
     (homogeneous(), CURRENTS, MATRIX[:, -np.arange(8) % 8], {}, "in the opposite direction"),
     (homogeneous() * GAINS, CURRENTS, MATRIX, {}, "Exchanging injection and measurement"),
     (homogeneous() * GAINS, CURRENTS, MATRIX, {"correction": "gain"}, ""),
     (1e6 * homogeneous(), CURRENTS, MATRIX, {}, "other units"),
-    (homogeneous(), 1e3 * CURRENTS, MATRIX, {}, "other units"),
     (1e3 * homogeneous(), CURRENTS, MATRIX, {"conductivity": SIGMA}, "not in volts"),
     (homogeneous(noise=1e-3) + DEAD @ MATRIX.T, CURRENTS, MATRIX, {}, "Electrode 5 looks dead")])
 def test_contradictions_cause_warnings(voltages, currents, matrix, options, warning):

@@ -96,8 +96,8 @@ def test_a_span_changes_the_digest(folder):
 
 
 @pytest.mark.parametrize(("change", "message"), [
-    ({"licence": ""}, "case.licence"), ({"sha256": "abc"}, "case.sha256"), ({"vessel": 3}, "case.vessel"),
-    ({"title": date(2023, 1, 1)}, r"a\.yml: case: Unsupported type: 'date'"), ({"span": "0:800"}, r"case\.span"),
+    ({"licence": ""}, "case.licence"), ({"sha256": "abc"}, "case.sha256"),
+    ({"title": date(2023, 1, 1)}, r"a\.yml: case: Unsupported type: 'date'"),
     ({"span": [9, 4]}, r"case\.span: must be two increasing numbers, got \[9, 4\]"),
     ({"frames": 3}, "case: .*'frames' was unexpected"),
     ({"auxiliary_files": {"ref.mat": "1"}}, "case.auxiliary_files.ref.mat")])
@@ -135,21 +135,13 @@ def record_path(results, method):
     return path
 
 
-def test_run_shows_the_withheld_rmse(folder, results):
-    """The table, here of the submitted episodes, has the withheld RMSE instead of ẽ_c."""
+def test_submit_writes_records_with_the_scores_of_a_run(folder, results):
+    """Five episodes withhold different measurements; `run` shows their withheld RMSE instead of ẽ_c, `verify` reruns
+    them, and leaderboards of worlds ignore them."""
     code, output, err = eitbench("run", "--env", ID, "--baseline", "homogeneous", "--seeds", "test:0-4", "--jobs", 1,
                                  "--out", folder / "store")
     assert code == 0 and "5 of 5 episodes are already stored" in output + err, err
-    head, _, row = (line for line in output.splitlines() if line.startswith("|"))
-    episodes = read_record(record_path(results, "homogeneous"))["episodes"]
-    rmse = [episode["scores"]["prediction_error"] for episode in episodes]
-    shown = row.split("|")[[cell.strip() for cell in head.split("|")].index("withheld RMSE")]
-    assert float(shown.split("±")[0]) == pytest.approx(np.mean(rmse), rel=0.1)
-    assert "ẽ_c" not in head
-
-
-def test_submit_writes_records_with_the_scores_of_a_run(results):
-    """Five episodes withhold different measurements; `verify` reruns them, and leaderboards of worlds ignore them."""
+    assert "withheld RMSE" in output and "ẽ_c" not in output
     written = read_record(record_path(results, "homogeneous"))
     assert written["seeds"] == [f"test:{k}" for k in range(5)]
     run = run_on_measurements(gym.make(ID).unwrapped, "homogeneous", 1)
@@ -313,11 +305,3 @@ def test_nothing_is_kept_of_a_wrong_download(server, tmp_path):
         with pytest.raises(ValueError, match=message):
             download_case(read_case(offer_case(offered, given, **changes)))
         assert not (tmp_path / "measured").exists() or not [*(tmp_path / "measured").iterdir()]
-
-
-def test_built_in_addresses_name_a_commit():
-    """A branch would change; the sha256 of each file is in the case."""
-    addresses = {path.stem: read_case(path.stem).address for path in CASES.glob("*.yml")}
-    assert sum(map(bool, addresses.values())) == 9
-    for name, address in addresses.items():
-        assert not address or any(len(part) == 40 for part in address.split("/")), name

@@ -1,6 +1,5 @@
 """`MeasuredEnv`: withheld measurements, rewards, seeds, and the observation model."""
 
-import copy
 import pickle
 from dataclasses import replace
 
@@ -92,14 +91,13 @@ def test_seeds_draw_the_withheld_measurements(masks_only):
     assert (sequences[0][0] != sequences[0][1]).any() or (sequences[0][1] != sequences[0][2]).any()
 
 
-@pytest.mark.parametrize("make_copy", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))])
-def test_copies_continue_the_episode(quick, make_copy):
+def test_copies_continue_the_episode(quick):
     env = quick.unwrapped
     env.reset(seed=1)
     action = np.full(env.action_space.shape, env.task.expected_concentration)
     for _ in range(10):
         env.step(action)
-    other = make_copy(env)
+    other = pickle.loads(pickle.dumps(env))
     assert env.step(action)[1] == other.step(action)[1] < 0.0
 
 
@@ -113,11 +111,8 @@ def test_repeated_injections_in_a_frame_are_not_motion(measurements):
 
 @pytest.mark.parametrize(("changes", "message"), [
     ({"vessel": VESSEL | {"electrodes": 16}}, "vessel must have the 8 electrodes of the measurements, got 16"),
-    ({"withheld": 0.7}, "withheld"), ({"correction": "most"}, "correction must be one of"),
-    ({"model_error": -1.0}, "model_error"), ({"homogeneous_frames": 0}, "n_frames must be")])
+    ({"withheld": 0.7}, "withheld"), ({"correction": "most"}, "correction must be one of")])
 def test_invalid_arguments_are_named(measurements, changes, message):
-    if "homogeneous_frames" in changes:
-        measurements = replace(measurements, reference=None)
     with pytest.raises(ValueError, match=message):
         MeasuredEnv(**{"file": measurements, "vessel": VESSEL, **FIXED_STDS} | changes)
 
@@ -169,16 +164,15 @@ def test_the_random_walk_conserves_mass_and_the_initial_variance(env):
     assert np.diag(walk.covariance).mean() == pytest.approx(1.0, rel=0.05)
 
 
-@pytest.mark.parametrize(("name", "world"), [
-    ("log_inflow_filter", "eitbench/Pipe2D-v0"), ("joint_inflow_filter", "eitbench/Pipe2DUnknownVelocity-v0")])
-def test_measurements_of_an_episode_give_the_same_estimates(tmp_path, name, world):
-    """Methods on a file through `MeasurementModel` agree to rounding with the simulated environment."""
+def test_measurements_of_an_episode_give_the_same_estimates(tmp_path):
+    """A method on a file through `MeasurementModel` agrees to rounding with the simulated environment."""
+    world = "eitbench/Pipe2DUnknownVelocity-v0"
     env = EstimationEnv(world, **short.world(world))
     measurements = Measurements.load(simulate_measurements(env, 0).save(tmp_path / "episode.h5"))
     task = env.task
     model = MeasurementModel(task.observation, measurements.currents, measurements.matrix)
     file_task = replace(task, observation=model)
-    method = load_method(name, "estimation")
+    method = load_method("joint_inflow_filter", "estimation")
     assert method.suits(file_task)
     on_episode, on_file = method.make(task), method.make(file_task)
     observation, _ = env.reset(seed=0)

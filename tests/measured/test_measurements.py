@@ -28,13 +28,9 @@ def small(**changes):
     ({"matrix": np.eye(4)}, "matrix.*3"),
     ({"voltages": np.ones((3, 2))}, r"voltages must have shape \(any, 3\), got \(3, 2\)"),
     ({"voltages": np.full((3, 3), np.nan)}, "voltages must hold numbers, got NaN only"),
-    ({"voltages": np.ones((3, 3)) * 1j}, "voltages must be an array of numbers in V, got ndarray of complex128"),
     ({"voltages": np.full((3, 3), np.inf)}, "voltages must be finite or NaN"),
-    ({"voltages": np.ones((0, 3))}, "voltages must hold numbers"),
     ({"injection_index": np.array([0, 1, 2])}, "injection_index must be from 0 to 1, got 0 to 2"),
-    ({"injection_index": np.array([0.0, 1, 0])}, "injection_index must be 3 integers"),
     ({"times": np.array([0.0, 0.2, 0.1])}, "times must increase, got 0.2 s and then 0.1 s"),
-    ({"times": np.array([0.0, 0.2])}, "times"),
     ({"reference": np.ones((1, 3, 3))}, "reference must have shape"),
 ])
 def test_contradictory_fields_are_named(changes, message):
@@ -56,10 +52,9 @@ def test_file_restores_all_fields(tmp_path):
     np.testing.assert_array_equal(part.voltages, measurements.voltages[8:12])
 
 
-@pytest.mark.parametrize("length", [0, 2000])
-def test_broken_files_are_named(tmp_path, length):
+def test_broken_files_are_named(tmp_path):
     path = moving(frames=1).save(tmp_path / "moving.h5")
-    path.write_bytes(path.read_bytes()[:length])
+    path.write_bytes(path.read_bytes()[:2000])
     with pytest.raises(ValueError, match=r"moving\.h5 must be a file of measurements"):
         Measurements.load(path)
 
@@ -115,9 +110,6 @@ def test_large_files_are_memory_mapped(tmp_path, monkeypatch):
     assert not long.voltages.flags.writeable
     np.testing.assert_array_equal(short_voltages, long_voltages)
     np.testing.assert_array_equal(long.voltages[48_000:48_480], short.voltages)
-    part = read(paths[1], steps=slice(48_000, 48_480))
-    np.testing.assert_array_equal(part.voltages, short.voltages)
-    assert part.times[0] == 480.0
     with pytest.raises(ValueError, match=r"large.h5.*steps must select some of the 144000 measurement vec"):
         read(paths[1], steps=slice(2_000_000, None))
 
