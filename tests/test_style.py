@@ -16,7 +16,7 @@ before it."""
 TOP = 436
 """Lines allowed in the other modules at the top: public names, argument checks, files, messages."""
 BASELINES = 2290
-TESTS = 18_296
+TESTS = 18_314
 MODULES = {".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__"): path
            for path in PACKAGE.rglob("*.py")}
 

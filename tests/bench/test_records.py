@@ -217,3 +217,13 @@ def test_large_and_special_files_are_not_opened(tmp_path):
         with pytest.raises(ValueError, match=r"it\.json cannot be read: it must be a file of at most 8 MiB"):
             read_record(path)
         path.rmdir() if path.is_dir() else path.unlink()
+
+
+def test_versions_and_splits_have_separate_files(tmp_path):
+    """Other versions of the method, or other seeds, do not replace a record; runs with other library versions do."""
+    other_code = RUN | {"source": sha("newer")}
+    for each in (MINE, record("mine", [0.1], version="2"), record("mine", [0.1], version="v1"),
+                 record("mine", {"dev:0": 0.1}), record("mine", [0.3], runs=[other_code])):
+        write_record(tmp_path, each)
+    assert len(read_records(tmp_path)) == 4
+    assert MINE not in read_records(tmp_path)

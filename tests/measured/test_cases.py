@@ -305,3 +305,11 @@ def test_nothing_is_kept_of_a_wrong_download(server, tmp_path):
         with pytest.raises(ValueError, match=message):
             download_case(read_case(offer_case(offered, given, **changes)))
         assert not (tmp_path / "measured").exists() or not [*(tmp_path / "measured").iterdir()]
+
+
+def test_built_in_addresses_name_a_commit():
+    """A branch would change; the sha256 of each file is in the case."""
+    addresses = {path.stem: read_case(path.stem).address for path in CASES.glob("*.yml")}
+    assert sum(map(bool, addresses.values())) == 9
+    for name, address in addresses.items():
+        assert not address or any(len(part) == 40 for part in address.split("/")), name
