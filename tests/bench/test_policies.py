@@ -263,7 +263,7 @@ def test_adaptivity_gap_is_the_formula():
 
 
 def test_ratios_compare_means():
-    """The mean errors are 4, 2 and 1: the fraction of the oracle's gain is 2/3. Of each kind the best policy counts,
+    """The mean errors are 4, 2 and 1: the fraction of the oracle's gain is 2/3. The best policy of each kind counts,
     without oracles and random pairs. For policies with the score of a body the text has the ratio of mean squares."""
     table = hand_made(best_cycle=[2.0, 4.0, 6.0], greedy_a=[1.0, 3.0, 2.0], one_step_oracle=[1.0, 1.0, 1.0])
     fraction = attained_fraction(table, "greedy_a", "best_cycle", "one_step_oracle")

@@ -50,7 +50,7 @@ def test_checkers_pass_for_policies(id, kwargs):
 
 @pytest.mark.parametrize(("id", "estimator", "observation"), [*((id, None, None) for id in KINDS), *POLICIES])
 def test_contract(id, estimator, observation):
-    """The world is that of the id but for the changes. The last step is terminated and not truncated, values have the
+    """The world of the id has the changes only. The last step is terminated and not truncated, values have the
     required types, arrays are new and within their spaces; pickling and the spec in JSON conserve the environment."""
     env = injection_envs.make(estimator, id, observation) if estimator else make(id)
     actions = some_actions(env) if estimator else noise_actions(env)
