@@ -161,7 +161,8 @@ def methods() -> str:
 def plant(*ids: str) -> str:
     """Return the table of the scores of flows and slugs in environments, by the flow's error."""
     shown = [scores()[name] for name in PLANT_SCORES]
-    found = leaderboard().dropna(subset="solute_flow_error").sort_values("solute_flow_error")
+    by = "solute_flow_error"
+    found = leaderboard().dropna(subset=by).sort_values([by, "method"])
     rows = [{"environment": id, "method": row["method"]} | {
                 score.heading: number_cell(score.factor * row[score.name]) for score in shown}
             for id in ids for _, row in found[found["environment"] == id].iterrows()]

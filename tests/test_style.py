@@ -10,13 +10,13 @@ import pytest
 ROOT = Path(__file__).parent.parent
 PACKAGE = ROOT / "eitbench"
 BUDGETS = {"numerics": 1676, "scoring": 205, "physics": 1716, "worlds": 2782, "data": 1501, "estimation": 6662,
-           "measured": 2106, "envs": 1653, "bench": 4673, "report": 2680, "rl": 863, "cli": 975}
+           "measured": 2106, "envs": 1653, "bench": 4672, "report": 2680, "rl": 863, "cli": 975}
 """Package (or module) -> lines of Python allowed, blank lines and docstrings included. Each imports only from those
 before it."""
 TOP = 436
 """Lines allowed in the other modules at the top: public names, argument checks, files, messages."""
 BASELINES = 2290
-TESTS = 18_314
+TESTS = 18_303
 MODULES = {".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__"): path
            for path in PACKAGE.rglob("*.py")}
 

@@ -280,8 +280,7 @@ def _load(track: str, id: str, kwargs: str, method: str, isolation: str, path: P
                          "results are stored; rename it")
     loaded = methods.method_from_attributes(track, name, str(path), worker, about)
     if loaded.privileged:
-        raise ValueError(f"{path} is privileged and needs the ground truth; --isolate none gives "
-                         "it")
+        raise ValueError(f"{path} is privileged; --isolate none gives it the ground truth")
     return loaded._replace(title=about["title"], path=path, sha256=worker.sha256)
 
 
