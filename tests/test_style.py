@@ -10,7 +10,7 @@ import pytest
 ROOT = Path(__file__).parent.parent
 PACKAGE = ROOT / "eitbench"
 BUDGETS = {"numerics": 1676, "scoring": 205, "physics": 1716, "worlds": 2782, "data": 1501, "estimation": 6662,
-           "measured": 2106, "envs": 1653, "bench": 4672, "report": 2680, "rl": 863, "cli": 975}
+           "measured": 2106, "envs": 1653, "bench": 4673, "report": 2680, "rl": 863, "cli": 975}
 """Package (or module) -> lines of Python allowed, blank lines and docstrings included. Each imports only from those
 before it."""
 TOP = 436

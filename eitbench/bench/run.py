@@ -255,8 +255,9 @@ def _run_job(job: Job, store: EpisodeStore, run: dict[str, Any], home: str,
              beginning: dict[str, Any], keep_estimates: bool) -> None:
     try:
         result, fields = run_episode(job)
-        if any(result[name] != beginning[name] for name in COMMON_FIELDS):
-            raise ValueError(f"{job.method}: metadata changed between episodes")
+        if changed := [name for name in COMMON_FIELDS if result[name] != beginning[name]]:
+            raise ValueError(f"{job.method} must not change during a run, got other values of "
+                             f"{', '.join(changed)} than at its start")
         # the identity of a world defined in a script depends on the script, unknown in this process
         result["identity"] = beginning["identity"]
     except Exception as error:
